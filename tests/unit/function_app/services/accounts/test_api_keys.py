@@ -153,16 +153,16 @@ def test_the_last_use_is_stored_once_an_hour(cloud: Cloud) -> None:
 
 
 class TestRevoking:
-    def test_it_is_refused_here_at_once_and_elsewhere_within_seconds(self, open_cloud: OpenCloud) -> None:
-        here, there = open_cloud(), open_cloud()
-        anna = here.sign_in("anna")
+    def test_it_is_refused_locally_at_once_and_in_other_processes_within_seconds(self, open_cloud: OpenCloud) -> None:
+        local, remote = open_cloud(), open_cloud()
+        anna = local.sign_in("anna")
         key, program = make(anna)
-        elsewhere = Program(there, program.token)
+        elsewhere = Program(remote, program.token)
         assert program.get("/devices").status_code == elsewhere.get("/devices").status_code == 200
-        problem(here.sign_in("bert").delete(f"{KEYS}/{key}"), 404, "api-key-unknown")
+        problem(local.sign_in("bert").delete(f"{KEYS}/{key}"), 404, "api-key-unknown")
         assert anna.delete(f"{KEYS}/{key}").status_code == 204
         problem(program.get("/devices"), 401, "unauthorized")
-        here.clock.advance(5)
+        local.clock.advance(5)
         problem(elsewhere.get("/devices"), 401, "unauthorized")
         problem(anna.delete(f"{KEYS}/{key}"), 404, "api-key-unknown")
         assert anna.get(KEYS).json()["items"] == []

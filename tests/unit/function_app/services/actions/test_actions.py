@@ -141,8 +141,8 @@ def test_an_explicit_lease_outlives_the_action(anna: Person, robot: Robot, acqui
 
 def test_an_epoch_that_is_not_the_callers_starts_nothing(cloud: Cloud, anna: Person, robot: Robot) -> None:
     epoch = anna.take_lease(robot.device).json()["epoch"]
-    for caller, given in ((anna, epoch + 1), (cloud.sign_in("anna"), epoch)):
-        assert problem(caller.start(robot.device, epoch=given), 409, "lease-lost")["current_epoch"] == epoch
+    for caller, value in ((anna, epoch + 1), (cloud.sign_in("anna"), epoch)):
+        assert problem(caller.start(robot.device, epoch=value), 409, "lease-lost")["current_epoch"] == epoch
     robot.publish_presence(online=False)
     problem(anna.start(robot.device), 409, "device-offline")
     assert robot.received(MoveJoints) == []
@@ -242,6 +242,6 @@ def test_requests_beyond_the_devices_description_are_refused(anna: Person, robot
     refusal = problem(anna.start(robot.device, request=sit), 422, "unable")
     assert "no posture 'Sit'; it has: Stand, Crouch." in refusal["detail"]
     assert refusal["names"] == ["Stand", "Crouch"]
-    spoken = anna.start(robot.device, request={"kind": "say", "text": "hello"})
-    assert problem(spoken, 422, "unable")["names"] == ["move_joints", "take_posture"]
+    rejected = anna.start(robot.device, request={"kind": "say", "text": "hello"})
+    assert problem(rejected, 422, "unable")["names"] == ["move_joints", "take_posture"]
     assert robot.received(Say) == []

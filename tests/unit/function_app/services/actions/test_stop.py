@@ -62,32 +62,32 @@ def test_an_offline_robot_receives_stop(anna: Person, robot: Robot) -> None:
 @pytest.fixture
 def two_rooms(cloud: Cloud) -> Iterator[TwoRooms]:
     """Anna with two arms in her first space, and one in the lab."""
-    with paired(cloud, "anna", "left", "right") as (anna, here), cloud.robot() as there:
+    with paired(cloud, "anna", "left", "right") as (anna, first), cloud.robot() as second:
         lab = anna.post("/spaces", {"name": "Lab"}).json()["id"]
-        there.pair(anna)
-        assert anna.put(f"/agents/{there.id}/space", {"space": lab}).status_code == 200
-        there.space = lab
-        there.connect()
-        yield anna, here, there, lab
+        second.pair(anna)
+        assert anna.put(f"/agents/{second.id}/space", {"space": lab}).status_code == 200
+        second.space = lab
+        second.connect()
+        yield anna, first, second, lab
 
 
 def test_all_devices_of_a_space_are_stopped_and_no_others(two_rooms: TwoRooms) -> None:
-    anna, here, there, lab = two_rooms
-    answer = anna.post(f"/spaces/{here.space}/stop", {"reason": "smoke"})
-    assert (answer.status_code, confirmed(answer)) == (200, dict.fromkeys(here.devices, True))
-    assert sorted(command.device for command in here.received(StopDevice)) == ["left", "right"]
-    assert {stop.reason for stop in here.stops} == {"smoke"}
-    assert not there.commands
-    assert not there.stops
-    assert confirmed(anna.post(f"/spaces/{lab}/stop")) == {there.device: True}
+    anna, first, second, lab = two_rooms
+    answer = anna.post(f"/spaces/{first.space}/stop", {"reason": "smoke"})
+    assert (answer.status_code, confirmed(answer)) == (200, dict.fromkeys(first.devices, True))
+    assert sorted(command.device for command in first.received(StopDevice)) == ["left", "right"]
+    assert {stop.reason for stop in first.stops} == {"smoke"}
+    assert not second.commands
+    assert not second.stops
+    assert confirmed(anna.post(f"/spaces/{lab}/stop")) == {second.device: True}
     problem(anna.post("/spaces/nowhere/stop"), 404, "space-unknown")
 
 
 def test_all_devices_of_the_account_are_stopped_and_no_others(cloud: Cloud, two_rooms: TwoRooms) -> None:
-    anna, here, there, _ = two_rooms
+    anna, first, second, _ = two_rooms
     with paired(cloud, "bert") as (bert, other):
         answer = anna.post("/stop")
-        assert (answer.status_code, confirmed(answer)) == (200, dict.fromkeys([*here.devices, there.device], True))
+        assert (answer.status_code, confirmed(answer)) == (200, dict.fromkeys([*first.devices, second.device], True))
         assert not other.commands
         assert not other.stops
         assert confirmed(bert.post("/stop")) == {other.device: True}
@@ -95,17 +95,17 @@ def test_all_devices_of_the_account_are_stopped_and_no_others(cloud: Cloud, two_
 
 
 def test_an_unresponsive_device_delays_no_other_and_is_named(two_rooms: TwoRooms) -> None:
-    anna, here, there, _ = two_rooms
-    waiting = [anna.start(here.device, policy="queue", wait_ms=0).json()["id"] for _ in range(3)]
-    there.silent = True
+    anna, first, second, _ = two_rooms
+    waiting = [anna.start(first.device, policy="queue", wait_ms=0).json()["id"] for _ in range(3)]
+    second.silent = True
     call = anna.begin("POST", "/stop")
-    assert len(here.received(StopDevice)) == 2
+    assert len(first.received(StopDevice)) == 2
     answer = call()
     assert answer.status_code == 207
-    assert confirmed(answer) == {here.devices[0]: True, here.devices[1]: True, there.device: False}
-    assert len(there.stops) >= 3, "repeated until the time limit"
+    assert confirmed(answer) == {first.devices[0]: True, first.devices[1]: True, second.device: False}
+    assert len(second.stops) >= 3, "repeated until the time limit"
     assert [anna.action(action)["status"] for action in waiting[1:]] == ["cancelled"] * 2
-    events = anna.get(f"/devices/{there.device}/events").json()["items"]
+    events = anna.get(f"/devices/{second.device}/events").json()["items"]
     assert [item["kind"] for item in events if item["kind"].startswith("stop")] == ["stop-ordered"]
 
 

@@ -27,13 +27,13 @@ def other(cloud: Cloud) -> Person:
     return cloud.sign_in("anna")
 
 
-def ask(person: Person, robot: Robot, **options: Any) -> Any:
+def request_control(person: Person, robot: Robot, **options: Any) -> Any:
     return person.post(f"/devices/{robot.device}/lease/requests", options)
 
 
 def create(person: Person, robot: Robot, **options: Any) -> str:
     """Request control and return the path of the request."""
-    answer = ask(person, robot, **options)
+    answer = request_control(person, robot, **options)
     assert answer.status_code == 201, answer.text
     return f"/devices/{robot.device}/lease/requests/{answer.json()['request']['id']}"
 
@@ -59,7 +59,7 @@ def test_an_accepted_request_gives_the_requester_the_next_epoch(
     issued = anna.post("/mqtt/credentials", body).json()
     with broker.connect(issued["client_id"], Credentials(issued["username"], issued["password"])) as client:
         assert client.connected.is_set()
-        answer = ask(other, robot, within_ms=30_000, lease_ms=45_000)
+        answer = request_control(other, robot, within_ms=30_000, lease_ms=45_000)
         assert (answer.status_code, answer.json()["confirmed"]) == (201, True)
         shown = answer.json()["request"]
         request = f"/devices/{robot.device}/lease/requests/{shown['id']}"
@@ -133,9 +133,9 @@ def test_an_unanswered_request_expires(cloud: Cloud, anna: Person, other: Person
 def test_one_request_is_open_at_a_time_and_only_the_holder_answers(cloud: Cloud, other: Person, robot: Robot) -> None:
     third, bert = cloud.sign_in("anna"), cloud.sign_in("bert")
     request = create(other, robot)
-    again = ask(other, robot)
+    again = request_control(other, robot)
     assert (again.status_code, again.json()["request"]["id"]) == (200, request.rpartition("/")[2])
-    assert problem(ask(third, robot), 409, "lease-requested")["requester"] == "anna"
+    assert problem(request_control(third, robot), 409, "lease-requested")["requester"] == "anna"
     assert lease(third, robot)["request"]["id"] == request.rpartition("/")[2]
     for verb in ("accept", "reject"):
         for person in (other, third):
@@ -148,10 +148,10 @@ def test_one_request_is_open_at_a_time_and_only_the_holder_answers(cloud: Cloud,
 
 def test_invalid_requests_are_refused(anna: Person, other: Person, robot: Robot) -> None:
     for options in ({"within_ms": 999}, {"within_ms": 120_001}, {"lease_ms": 1}, {"who": "me"}):
-        problem(ask(other, robot, **options), 422, "invalid")
-    problem(ask(anna, robot), 409, "lease-already-held")
+        problem(request_control(other, robot, **options), 422, "invalid")
+    problem(request_control(anna, robot), 409, "lease-already-held")
     anna.delete(f"/devices/{robot.device}/lease?epoch=1")
-    problem(ask(other, robot), 409, "lease-free")
+    problem(request_control(other, robot), 409, "lease-free")
     unknown = f"/devices/{robot.device}/lease/requests/nothing"
     problem(anna.get(unknown), 404, "request-unknown")
     problem(other.post(f"{unknown}/accept"), 404, "request-unknown")
@@ -207,7 +207,7 @@ def test_only_an_owner_takes_over_and_a_viewer_has_no_control(
     refusal = problem(other.take_lease(robot.device, take_over=True, reason="now"), 403, "forbidden")
     if role is Role.VIEWER:
         problem(other.take_lease(robot.device), 403, "forbidden")
-        problem(ask(other, robot), 403, "forbidden")
+        problem(request_control(other, robot), 403, "forbidden")
         problem(anna.post(f"{request}/accept"), 403, "forbidden")
         for path in ("stop", "stop/reset"):
             problem(other.post(f"/devices/{robot.device}/{path}"), 403, "forbidden")
@@ -272,7 +272,7 @@ def test_the_device_may_end_the_lease(cloud: Cloud, anna: Person, other: Person,
     robot.publish_state(State(device="arm", at_ms=now_ms, tick_ms=2, mode=Mode.HOLDING, epoch=1, ended_epoch=1))
     assert lease(anna, robot) is None
     assert anna.get(f"/devices/{robot.device}").json()["lease"] is None
-    problem(ask(other, robot), 409, "lease-free")
+    problem(request_control(other, robot), 409, "lease-free")
     action = other.start(robot.device, wait_ms=10_000).json()
     assert (action["status"], action["epoch"]) == ("started", 2)
     assert anna.take_lease(robot.device).status_code == 409
@@ -281,7 +281,7 @@ def test_the_device_may_end_the_lease(cloud: Cloud, anna: Person, other: Person,
 
 def test_an_unresponsive_device_confirms_with_the_next_renewal(anna: Person, other: Person, robot: Robot) -> None:
     robot.silent = True
-    answer = ask(other, robot, wait_ms=50)
+    answer = request_control(other, robot, wait_ms=50)
     assert (answer.status_code, answer.json()["confirmed"]) == (201, False)
     request = f"/devices/{robot.device}/lease/requests/{answer.json()['request']['id']}"
     assert anna.post(f"{request}/accept", {"wait_ms": 0}).json()["confirmed"] is False
@@ -303,7 +303,7 @@ def test_release_and_the_lease_of_an_action_are_recorded(cloud: Cloud, anna: Per
 
 def test_without_a_broker(anna: Person, other: Person, robot: Robot, broker: MemoryBroker) -> None:
     broker.reachable = False
-    answer = ask(other, robot)
+    answer = request_control(other, robot)
     assert (answer.status_code, answer.json()["confirmed"]) == (201, False)
     request = f"/devices/{robot.device}/lease/requests/{answer.json()['request']['id']}"
     assert anna.post(f"{request}/reject").json()["outcome"] == "rejected"

@@ -72,8 +72,8 @@ def test_control_requires_the_current_lease(cloud: Cloud, anna: Person, robot: R
     problem(anna.post("/mqtt/credentials", {**body, "epoch": 1}), 409, "lease-lost")
     epoch = anna.take_lease(robot.device, lease_ms=600_000).json()["epoch"]
     assert anna.post("/mqtt/credentials", {**body, "epoch": epoch}).json()["lifetime_s"] == 600
-    for person, given in ((anna, epoch + 1), (cloud.sign_in("anna"), epoch)):
-        problem(person.post("/mqtt/credentials", {**body, "epoch": given}), 409, "lease-lost")
+    for person, value in ((anna, epoch + 1), (cloud.sign_in("anna"), epoch)):
+        problem(person.post("/mqtt/credentials", {**body, "epoch": value}), 409, "lease-lost")
     problem(cloud.sign_in("bert").post("/mqtt/credentials", {**body, "epoch": epoch}), 404, "device-unknown")
     cloud.clock.advance(600)
     problem(anna.post("/mqtt/credentials", {**body, "epoch": epoch}), 409, "lease-lost")

@@ -23,7 +23,7 @@ from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person, paired
 
 
-def hear(cloud: Cloud, topic: str, message: Any) -> None:
+def ingest_message(cloud: Cloud, topic: str, message: Any) -> None:
     """Ingest a message as if the broker had delivered it."""
     payload = message if isinstance(message, bytes) else codec.encode(message)
     cloud.run(ingest(cloud.functions, topic, payload))
@@ -52,7 +52,7 @@ def test_presence_and_state_are_shown(anna: Person, robot: Robot) -> None:
 def test_presence_of_earlier_connections_is_ignored(cloud: Cloud, anna: Person, robot: Robot) -> None:
     steps = ((7, True, True), (6, False, True), (7, False, False), (7, True, False), (8, True, True))
     for session, present, expected in steps:
-        hear(cloud, topics.conn(robot.space, robot.id), Presence(online=present, session=session, at_ms=0))
+        ingest_message(cloud, topics.conn(robot.space, robot.id), Presence(online=present, session=session, at_ms=0))
         assert online(anna, robot) is expected
 
 
@@ -61,7 +61,7 @@ def test_a_silent_robot_is_offline_after_90_s(cloud: Cloud, anna: Person, robot:
     assert online(anna, robot)
     cloud.clock.advance(20)
     assert not online(anna, robot)
-    hear(cloud, robot.topic(topics.STATE), state())
+    ingest_message(cloud, robot.topic(topics.STATE), state())
     assert online(anna, robot)
 
 
@@ -76,7 +76,7 @@ def test_an_agent_cannot_publish_for_another(cloud: Cloud, anna: Person, robot: 
             (topics.device(robot.space, "zzzzzzzzzz", "arm", "state"), state()),
             (topics.device(robot.space, robot.id, "arm", "tele", "joints"), state()),
         ):
-            hear(cloud, topic, message)
+            ingest_message(cloud, topic, message)
         assert anna.get("/devices").json() == before
 
 
@@ -84,9 +84,9 @@ def test_an_agent_cannot_publish_for_another(cloud: Cloud, anna: Person, robot: 
 def test_invalid_messages_are_dropped(cloud: Cloud, anna: Person, robot: Robot, payload: bytes) -> None:
     before = anna.get("/devices").json()
     for kind in (topics.STATE, topics.DESC, topics.EVENT, topics.ACK):
-        hear(cloud, robot.topic(kind), payload)
-    hear(cloud, topics.conn(robot.space, robot.id), payload)
-    hear(cloud, "some/other/topic", payload)
+        ingest_message(cloud, robot.topic(kind), payload)
+    ingest_message(cloud, topics.conn(robot.space, robot.id), payload)
+    ingest_message(cloud, "some/other/topic", payload)
     assert anna.get("/devices").json() == before
 
 
@@ -96,8 +96,8 @@ def test_an_event_and_a_description_are_stored_once(cloud: Cloud, anna: Person, 
         for number in (1, 2):
             at_ms = 1_700_000_000_000 + number
             event = Event(id=f"e{number}", device="arm", at_ms=at_ms, kind="fault", severity="error", message="hot")
-            hear(cloud, robot.topic(topics.EVENT), event)
-        hear(cloud, robot.topic(topics.DESC), description)
+            ingest_message(cloud, robot.topic(topics.EVENT), event)
+        ingest_message(cloud, robot.topic(topics.DESC), description)
     items = anna.get(f"/devices/{robot.device}/events").json()["items"]
     assert [item["id"] for item in items] == ["e2", "e1"], "newest first"
     row = cloud.run(cloud.functions.tables.get(records.DESCRIPTIONS, robot.id, "arm"))
@@ -114,32 +114,32 @@ class TestAcks:
         statuses = (AckStatus.RECEIVED, AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE)
         acks = [robot.ack(action, status) for status in statuses]
         for number in (2, 0, 2, 3, 1, 3, 0):
-            hear(cloud, robot.topic(topics.ACK), acks[number])
-        hear(cloud, robot.topic(topics.ACK), robot.ack(action, AckStatus.FAILED))
+            ingest_message(cloud, robot.topic(topics.ACK), acks[number])
+        ingest_message(cloud, robot.topic(topics.ACK), robot.ack(action, AckStatus.FAILED))
         shown = anna.action(action)
         assert shown["status"] == "done"
         assert {"received_ms", "started_ms", "done_ms"} <= set(shown["times"])
         robot.silent = False
         second = anna.start(robot.device, wait_ms=10_000).json()["id"]
-        hear(cloud, robot.topic(topics.ACK), acks[3])
+        ingest_message(cloud, robot.topic(topics.ACK), acks[3])
         assert anna.start(robot.device).json()["action"] == second, "a late ack does not free another action's slot"
 
     def test_foreign_and_unknown_acks_are_ignored(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
         action = anna.start(robot.device, wait_ms=10_000).json()["id"]
         with paired(cloud, "bert") as (_, other):
             done = robot.ack(action, AckStatus.DONE)
-            hear(cloud, other.topic(topics.ACK), done)
+            ingest_message(cloud, other.topic(topics.ACK), done)
             other.publish(other.topic(topics.ACK), done)
             other.report(action, AckStatus.FAILED)
         for name in ("x", f"{robot.device}-{'0' * 20}", robot.device):
-            hear(cloud, robot.topic(topics.ACK), robot.ack(name, AckStatus.DONE))
+            ingest_message(cloud, robot.topic(topics.ACK), robot.ack(name, AckStatus.DONE))
         assert anna.action(action)["status"] == "started"
 
     def test_a_deeply_nested_result_does_not_prevent_the_end(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
         action = anna.start(robot.device, wait_ms=10_000).json()["id"]
         ack = codec.encode(robot.ack(action, AckStatus.DONE))
         deep = b'"result":{"a":' + b"[" * 600 + b"]" * 600 + b"}"
-        hear(cloud, robot.topic(topics.ACK), ack.replace(b'"result":{}', deep))
+        ingest_message(cloud, robot.topic(topics.ACK), ack.replace(b'"result":{}', deep))
         assert anna.action(action)["status"] == "done"
         assert anna.get(f"/devices/{robot.device}/actions").status_code == 200
 

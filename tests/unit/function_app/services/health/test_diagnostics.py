@@ -54,16 +54,16 @@ def warming(level: float, per_minute: float) -> Temperature:
     return lambda number: level + per_minute * number / MINUTE
 
 
-def health(cloud: Cloud, who: Person, robot: Robot) -> str:
+def health(cloud: Cloud, person: Person, robot: Robot) -> str:
     """Publish a state; return the health of the robot."""
     now_ms = cloud.clock.now_ms()
     state = State(device="arm", at_ms=now_ms, tick_ms=now_ms, mode=Mode.IDLE, epoch=0)
     cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), codec.encode(state)))
-    return str(diagnostics(who, robot)["health"])
+    return str(diagnostics(person, robot)["health"])
 
 
-def diagnostics(who: Person, robot: Robot) -> dict[str, Any]:
-    answer = who.get(f"/devices/{robot.device}/diagnostics")
+def diagnostics(person: Person, robot: Robot) -> dict[str, Any]:
+    answer = person.get(f"/devices/{robot.device}/diagnostics")
     assert answer.status_code == 200, answer.text
     return answer.json()  # type: ignore[no-any-return]
 
@@ -74,12 +74,12 @@ def partition(cloud: Cloud, robot: Robot) -> str:
     return f"{robot.device}/{row.data['pairing']}"
 
 
-def field(who: Person, robot: Robot, name: str) -> dict[str, Any]:
-    return next(item for item in diagnostics(who, robot)["fields"] if item["field"] == name)
+def field(person: Person, robot: Robot, name: str) -> dict[str, Any]:
+    return next(item for item in diagnostics(person, robot)["fields"] if item["field"] == name)
 
 
-def open_faults(who: Person, robot: Robot) -> list[dict[str, Any]]:
-    items: list[dict[str, Any]] = who.get(f"/devices/{robot.device}/faults", params={"open": True}).json()["items"]
+def open_faults(person: Person, robot: Robot) -> list[dict[str, Any]]:
+    items: list[dict[str, Any]] = person.get(f"/devices/{robot.device}/faults", params={"open": True}).json()["items"]
     return items
 
 

@@ -18,28 +18,28 @@ from tests.harness.crash_injection import Killed
 
 def state(cloud: Cloud, *codes: str) -> State:
     now_ms = cloud.clock.now_ms()
-    found = tuple(Fault(code=code, message=f"{code}: look at it.", since_ms=now_ms) for code in codes)
-    return State(device="arm", at_ms=now_ms, tick_ms=now_ms, mode=Mode.IDLE, epoch=0, faults=found)
+    reported = tuple(Fault(code=code, message=f"{code}: inspect it.", since_ms=now_ms) for code in codes)
+    return State(device="arm", at_ms=now_ms, tick_ms=now_ms, mode=Mode.IDLE, epoch=0, faults=reported)
 
 
-def say(cloud: Cloud, robot: Robot, *codes: str) -> None:
+def report_faults(cloud: Cloud, robot: Robot, *codes: str) -> None:
     """Ingest a later state with these faults."""
     cloud.clock.advance(0.01)
     robot.publish_state(state(cloud, *codes))
 
 
-def faults(who: Person, robot: Robot, **query: Any) -> list[dict[str, Any]]:
-    return who.pages(f"/devices/{robot.device}/faults", **query)
+def faults(person: Person, robot: Robot, **query: Any) -> list[dict[str, Any]]:
+    return person.pages(f"/devices/{robot.device}/faults", **query)
 
 
-def events(who: Person, robot: Robot) -> list[str]:
+def events(person: Person, robot: Robot) -> list[str]:
     """The kinds of the device's events, oldest first."""
-    items = who.pages(f"/devices/{robot.device}/events")
+    items = person.pages(f"/devices/{robot.device}/events")
     return [event["kind"] for event in sorted(items, key=lambda event: str(event["at"]))]
 
 
-def device(cloud: Cloud, who: Person, robot: Robot) -> Device:
-    return cloud.run(cloud.functions.devices.get(Identity(who.account, who.name, who.session), robot.device))
+def device(cloud: Cloud, person: Person, robot: Robot) -> Device:
+    return cloud.run(cloud.functions.devices.get(Identity(person.account, person.name, person.session), robot.device))
 
 
 def heat(severity: Severity = Severity.WARNING) -> Report:
@@ -47,25 +47,25 @@ def heat(severity: Severity = Severity.WARNING) -> Report:
 
 
 def test_a_reported_fault_is_raised_acknowledged_and_cleared(cloud: Cloud, anna: Person, robot: Robot) -> None:
-    say(cloud, robot, "encoder")
+    report_faults(cloud, robot, "encoder")
     (fault,) = faults(anna, robot, open=True)
     expected = {"code": "encoder", "state": "raised", "source": "device", "severity": "error"}
-    assert fault.items() >= (expected | {"message": "encoder: look at it."}).items()
+    assert fault.items() >= (expected | {"message": "encoder: inspect it."}).items()
     cloud.clock.advance(1)
     answer = anna.post(f"/devices/{robot.device}/faults/{fault['id']}/acknowledge")
     assert answer.status_code == 200, answer.text
     assert (answer.json()["state"], answer.json()["acknowledged_by"]) == ("acknowledged", "anna")
-    say(cloud, robot, "encoder")
+    report_faults(cloud, robot, "encoder")
     assert faults(anna, robot, open=True)[0]["state"] == "acknowledged", "it stays open until it is cleared"
     cloud.clock.advance(1)
-    say(cloud, robot)
+    report_faults(cloud, robot)
     assert faults(anna, robot, open=True) == []
     (past,) = faults(anna, robot, open=False)
     assert (past["id"], past["state"]) == (fault["id"], "cleared")
     assert past["raised_at"] < past["acknowledged_at"] < past["cleared_at"]
     assert events(anna, robot) == ["fault-raised", "fault-acknowledged", "fault-cleared"]
     problem(anna.post(f"/devices/{robot.device}/faults/{fault['id']}/acknowledge"), 409, "fault-cleared")
-    say(cloud, robot, "encoder")
+    report_faults(cloud, robot, "encoder")
     (again,) = faults(anna, robot, open=True)
     assert (again["count"], again["state"]) == (2, "raised")
     assert [item["count"] for item in faults(anna, robot)] == [2, 1]
@@ -88,10 +88,10 @@ def test_a_worsened_fault_must_be_acknowledged_again(cloud: Cloud, anna: Person,
 def test_each_source_clears_its_own_faults_only(cloud: Cloud, anna: Person, robot: Robot) -> None:
     arm = device(cloud, anna, robot)
     cloud.run(cloud.functions.faults.settle(arm, "detector/health", [heat()]))
-    say(cloud, robot, "heat")
+    report_faults(cloud, robot, "heat")
     cloud.run(cloud.functions.faults.settle(arm, "detector/power", []))
     assert [fault["source"] for fault in faults(anna, robot, open=True)] == ["device", "detector"], "worst first"
-    say(cloud, robot)
+    report_faults(cloud, robot)
     assert [fault["source"] for fault in faults(anna, robot, open=True)] == ["detector"]
 
 
@@ -132,18 +132,18 @@ def test_a_kill_after_any_write_loses_nothing(cloud: Cloud, anna: Person, robot:
 class TestSilence:
     """A device that publishes nothing."""
 
-    def open(self, who: Person, robot: Robot) -> list[str]:
-        return [fault["code"] for fault in faults(who, robot, open=True)]
+    def open(self, person: Person, robot: Robot) -> list[str]:
+        return [fault["code"] for fault in faults(person, robot, open=True)]
 
     def test_silence_is_a_fault_until_the_next_message(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
-        say(cloud, robot)
+        report_faults(cloud, robot)
         cloud.clock.advance(SILENT_MS / 1000 - 5)
         cloud.sweep()
         assert self.open(anna, robot) == []
         cloud.clock.advance(10)
         cloud.sweep()
         assert self.open(anna, robot) == ["silent"]
-        say(cloud, robot)
+        report_faults(cloud, robot)
         assert self.open(anna, robot) == []
         cloud.clock.advance(SILENT_MS / 1000 + 5)
         cloud.sweep()
@@ -154,7 +154,7 @@ class TestSilence:
     def test_an_active_device_has_one_reminder(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
         for _ in range(12):
             cloud.clock.advance(30)
-            say(cloud, robot)
+            report_faults(cloud, robot)
             cloud.sweep()
         assert faults(anna, robot) == []
         notes = [
@@ -181,7 +181,7 @@ class TestSilence:
 
 
 def test_faults_are_private_to_their_owner(cloud: Cloud, anna: Person, robot: Robot) -> None:
-    say(cloud, robot, "encoder")
+    report_faults(cloud, robot, "encoder")
     (fault,) = faults(anna, robot)
     acknowledge = f"/devices/{robot.device}/faults/{fault['id']}/acknowledge"
     bert = cloud.sign_in("bert")
@@ -197,8 +197,8 @@ def test_faults_are_private_to_their_owner(cloud: Cloud, anna: Person, robot: Ro
 
 def test_the_history_pages_and_expires(cloud: Cloud, anna: Person, robot: Robot) -> None:
     for number in range(5):
-        say(cloud, robot, f"code-{number}")
-    say(cloud, robot)
+        report_faults(cloud, robot, f"code-{number}")
+    report_faults(cloud, robot)
     assert [item["code"] for item in faults(anna, robot, limit=3)] == [f"code-{n}" for n in (4, 3, 2, 1, 0)]
     cloud.clock.advance(KEEP_FAULTS_MS / 1000 + 10)
     cloud.sweep()
@@ -208,8 +208,8 @@ def test_the_history_pages_and_expires(cloud: Cloud, anna: Person, robot: Robot)
 
 
 def test_the_number_of_open_faults_is_bounded(cloud: Cloud, anna: Person, robot: Robot) -> None:
-    say(cloud, robot, *(f"code-{number}" for number in range(MAX_OPEN + 50)))
+    report_faults(cloud, robot, *(f"code-{number}" for number in range(MAX_OPEN + 50)))
     assert len(faults(anna, robot, open=True)) == MAX_OPEN
     codes = {"x" * 200, "", "ü:\n/\\#?", "open:cloud:silent"}
-    say(cloud, robot, *codes)
+    report_faults(cloud, robot, *codes)
     assert {fault["code"] for fault in faults(anna, robot, open=True)} == codes

@@ -30,7 +30,7 @@ SPEEDUP = 20.0
 class SimulatedAir:
     """Ingests the CO₂ measurements of a simulated laboratory with people, in accelerated time."""
 
-    def __init__(self, cloud: Cloud, who: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, cloud: Cloud, person: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
         self.cloud, self.now_s = cloud, 0.0
         manifest = msgspec.structs.replace(room.load(LAB), robots=())
         self.world = ManualWorld(manifest=manifest)
@@ -40,7 +40,7 @@ class SimulatedAir:
         self.meter = self.world.driver("co2")
         self.meter.connect()
         entry = self.world.entry("co2")
-        claim(who, robot, entry)
+        claim(person, robot, entry)
         ingest_description(cloud, robot, entry)
         self._topic = topics.device(robot.space, robot.id, "co2", topics.TELE, "co2")
         self._at_ms = cloud.clock.now_ms()
@@ -62,9 +62,9 @@ class SimulatedAir:
         self.cloud.run(ingest_telemetry(self.cloud.functions, messages))
 
 
-def claim(who: Person, robot: Robot, entry: RoomDeviceManifest) -> None:
+def claim(person: Person, robot: Robot, entry: RoomDeviceManifest) -> None:
     devices = [{"name": entry.name, "kind": entry.kind, "robot_type": entry.kind, "label": entry.label}]
-    who.post("/agents/claim", {"code": robot.enroll(devices=devices).json()["claim_code"]})
+    person.post("/agents/claim", {"code": robot.enroll(devices=devices).json()["claim_code"]})
     robot.space = robot.enrollment()["space"]
 
 

@@ -139,14 +139,14 @@ class TestAccessToken:
         assert request(cloud.sign_in("anna").token).status_code == 200
 
     def test_sign_out_ends_only_this_session_in_every_instance(self, open_cloud: OpenCloud) -> None:
-        here, there = open_cloud(), open_cloud()
-        ended, other = here.sign_in("anna"), here.sign_in("anna")
+        local, remote = open_cloud(), open_cloud()
+        ended, other = local.sign_in("anna"), local.sign_in("anna")
         headers = {"Authorization": f"Bearer {ended.token}"}
-        assert there.request("GET", f"{API}/accounts/me", headers=headers).status_code == 200
+        assert remote.request("GET", f"{API}/accounts/me", headers=headers).status_code == 200
         assert ended.post("/auth/sign-out").status_code == 204
         problem(ended.get("/accounts/me"), 401, "unauthorized")
-        here.clock.advance(5)
-        problem(there.request("GET", f"{API}/accounts/me", headers=headers), 401, "unauthorized")
+        local.clock.advance(5)
+        problem(remote.request("GET", f"{API}/accounts/me", headers=headers), 401, "unauthorized")
         assert other.get("/accounts/me").status_code == 200
 
     def test_forged_tokens_are_refused(self, cloud: Cloud) -> None:

@@ -118,11 +118,11 @@ def test_concurrent_timers_do_each_job_once(cloud: Cloud, anna: Person, robot: R
 
 
 def test_expired_codes_and_links_are_deleted(cloud: Cloud, memory: Memory) -> None:
-    kept = cloud.robot()
+    valid = cloud.robot()
     cloud.link("anna")
     cloud.robot().enroll()
     cloud.clock.advance(25 * 3600)
-    kept.enroll()
+    valid.enroll()
     for _ in range(20):
         cloud.sweep()
     assert [table for table, _ in memory.tables.rows("Claims", "SignIns")] == ["Claims"]
@@ -150,10 +150,10 @@ def test_a_claim_killed_after_any_write_is_complete_or_repeatable(
     robot = cloud.robot()
     code = robot.code()
     process, crash = crashing(cloud.clock)
-    there = at_instance(process, anna)
-    there.get("/accounts/me")
+    client = at_instance(process, anna)
+    client.get("/accounts/me")
     crash.left = writes
-    there.post("/agents/claim", {"code": code})
+    client.post("/agents/claim", {"code": code})
     if robot.enrollment()["state"] == "waiting":
         assert anna.get("/devices").json()["items"] == []
         assert anna.post("/agents/claim", {"code": code}).status_code == 200

@@ -21,7 +21,7 @@ LIVE = 20
 )
 def test_guessed_claim_codes_claim_nothing(cloud: Cloud, guesses: int) -> None:
     """Unlimited accounts with five attempts each: the number of codes (2.56·10¹⁰) protects."""
-    chance = random.Random(1)  # noqa: S311 (chance with a seed)
+    random_numbers = random.Random(1)  # noqa: S311 (random_numbers with a seed)
     functions = cloud.functions
 
     async def work() -> int:
@@ -34,9 +34,9 @@ def test_guessed_claim_codes_claim_nothing(cloud: Cloud, guesses: int) -> None:
                     row = await functions.tables.get(records.ATTEMPTS, account, "claim")
                     if row is not None:
                         await functions.tables.delete(records.ATTEMPTS, row)
-            who = Identity(accounts[number // 5 % 20], "x", f"s{chance.randrange(9)}")
+            caller = Identity(accounts[number // 5 % 20], "x", f"s{random_numbers.randrange(9)}")
             try:
-                await functions.claim.claim(who, new_claim_code(), None)
+                await functions.claim.claim(caller, new_claim_code(), None)
                 claimed += 1
             except Problem as problem:
                 answers.add(problem.code)
@@ -64,12 +64,12 @@ def test_one_of_a_hundred_concurrent_claims_succeeds(cloud: Cloud) -> None:
                 return problem.code
             return account
 
-        found = await asyncio.gather(*(one(account) for account in accounts))
+        results = await asyncio.gather(*(one(account) for account in accounts))
         row = await functions.tables.get(records.AGENTS, agent, "agent")
         assert row is not None
-        assert [each for each in found if each in accounts] == [row.data["account"]]
+        assert [each for each in results if each in accounts] == [row.data["account"]]
         replayed = await one(accounts[0])
-        return [each for each in (*found, replayed) if each not in accounts]
+        return [each for each in (*results, replayed) if each not in accounts]
 
     refusals = cloud.run(work())
     assert len(refusals) == 100

@@ -34,11 +34,11 @@ def furnish(anna: Person, robot: Robot, name: str = "arm") -> tuple[str, str]:
 
 def retained(cloud: Cloud, broker: MemoryBroker, space: str, agent: str, name: str) -> set[str]:
     """Topics of a device and its agent with a retained message."""
-    wanted = [f"{topics.ROOT}/{space}/{agent}/{name}/{kind}" for kind in ("state", "desc", "desc/twin")]
-    wanted.append(topics.conn(space, agent))
-    grant = broker.grant("look", publish=("look/x",), subscribe=tuple(wanted))
+    filters = [f"{topics.ROOT}/{space}/{agent}/{name}/{kind}" for kind in ("state", "desc", "desc/twin")]
+    filters.append(topics.conn(space, agent))
+    grant = broker.grant("look", publish=("look/x",), subscribe=tuple(filters))
     with broker.connect("look", cloud.run(cloud.functions.access.issue(grant))) as client:
-        client.subscribe(*wanted)
+        client.subscribe(*filters)
         return {message.topic for message in client.pending()}
 
 
@@ -98,10 +98,10 @@ def test_an_unpairing_killed_after_any_write_is_completed_by_the_timer(
     running, waiting = furnish(anna, robot)
     space = robot.space
     process, crash = crashing(cloud.clock)
-    there = at_instance(process, anna)
-    assert there.get("/accounts/me").status_code == 200
+    client = at_instance(process, anna)
+    assert client.get("/accounts/me").status_code == 200
     crash.left = after
-    there.delete(f"/agents/{robot.id}")
+    client.delete(f"/agents/{robot.id}")
     if anna.get(f"/devices/{robot.device}").status_code == 200:
         assert after == 1, "only before the deciding write"
         assert anna.delete(f"/agents/{robot.id}").status_code == 204

@@ -22,7 +22,7 @@ TYPES = sorted(folder.parent.name for folder in ROBOTS.glob("*/robot.toml"))
 
 
 async def flip_each(name: str, home: Path, *, stride: int) -> tuple[int, int]:
-    """Seal a type as if it had been uploaded, and change one byte after the other; how many in files, and in rows."""
+    """Seal a type and verify that every modified byte is detected; return the number of bytes in files and in rows."""
     files = {file.name: file.read_bytes() for file in sorted((ROBOTS / name).iterdir()) if file.is_file()}
     manifest = msgspec.to_builtins(manifests.parse(files["robot.toml"].decode()))
     seals = IntegritySeals(keys=FileKeys(home / "keys"))
@@ -41,7 +41,7 @@ async def flip_each(name: str, home: Path, *, stride: int) -> tuple[int, int]:
             changed[place] ^= 1 << place % 8
             in_files += 1
 
-    # What a row keeps of it, as text. A number may be written in two ways: the same one is no change.
+    # The row as text. Equal numbers in another notation are not a modification.
     row = {"manifest": good.manifest, "seal": records.to_data(good.seal)}
     stored = json.dumps(row).encode()
     rest = {**records.to_data(good), "manifest": {}, "seal": {}}

@@ -53,20 +53,22 @@ class TestVersions:
         anna.put(MINE, {"source": "# 1"})
         assert [item["version"] for item in anna.get(f"{MINE}/versions").json()["items"]] == [4]
         problem(anna.get(MINE, params={"version": 2}), 404, "movement-version-unknown")
-        assert len(scripts(memory)) == 4, "an action that was started with one may still be sent again"
+        assert len(scripts(memory)) == 4, "commands of running actions may be resent"
         alone.clock.advance((KEPT_MS + 1_000) / 1000)
         alone.run(alone.functions.retention.delete_due(alone.clock.now_ms()))
         assert scripts(memory) == ["# 1"]
         again = alone.sign_in("anna")
         assert again.get(MINE).json()["source"] == "# 1"
         page = alone.run(alone.functions.tables.query(records.MOVEMENTS, f"{anna.account}/ur5"))
-        assert len(page.rows) == 2, "a name and a version"
+        assert len(page.rows) == 2, "the row of the name and of its version"
         again.delete(MINE)
         alone.clock.advance((KEPT_MS + 1_000) / 1000)
         alone.run(alone.functions.retention.delete_due(alone.clock.now_ms()))
         assert scripts(memory) == []
         page = alone.run(alone.functions.tables.query(records.MOVEMENTS, f"{anna.account}/ur5"))
-        assert [row.key for row in page.rows] == ["mine"], "its name stays, so that no version is used twice"
+        assert [row.key for row in page.rows] == ["mine"], (
+            "the name row remains, so that version numbers are not reused"
+        )
 
     def test_concurrent_saves_get_one_version_each_and_leave_no_orphan_script(
         self, memory: Memory, anna: Person

@@ -1,4 +1,4 @@
-"""Movements: those that come with a robot type, and an account's own, which may shadow them."""
+"""Built-in movements of a robot type, and movements of an account, which may shadow them."""
 
 import hashlib
 from pathlib import Path
@@ -50,7 +50,7 @@ def test_an_own_movement_is_created_changed_and_deleted(anna: Person) -> None:
     problem(anna.get(MINE), 404, "movement-unknown")
     problem(anna.delete(MINE), 404, "movement-unknown")
     again = anna.put(MINE, {"source": SOURCE})
-    assert (again.status_code, again.json()["version"]) == (201, 3), "a version is never used twice"
+    assert (again.status_code, again.json()["version"]) == (201, 3), "version numbers are not reused"
 
 
 def test_an_own_movement_shadows_the_built_in_one_for_its_account_only(alone: Cloud, anna: Person) -> None:
@@ -87,13 +87,13 @@ def test_a_check_does_not_save_and_lists_available_names(anna: Person) -> None:
     checked = anna.post(f"{UR5}/scripting/check", {"source": '"""Wave."""\nrobot.home(\n'}).json()
     mark = checked["diagnostics"][0]
     assert (checked["savable"], mark["line"], mark["severity"]) == (False, 2, "error")
-    good = '"""Wave."""\nPARAMETERS = {"speed": {"type": "number", "default": 1}}\nrobot.posture("x")\n'
-    checked = anna.post(f"{UR5}/scripting/check", {"source": good}).json()
+    valid = '"""Wave."""\nPARAMETERS = {"speed": {"type": "number", "default": 1}}\nrobot.posture("x")\n'
+    checked = anna.post(f"{UR5}/scripting/check", {"source": valid}).json()
     assert (checked["savable"], checked["description"]) == (True, "Wave.")
     assert checked["parameters_schema"]["properties"]["speed"]["default"] == 1
-    told = anna.get(f"{UR5}/scripting").json()
-    assert "elbow" in told["names"]["joints"]
-    assert "robot" in [each["name"] for each in told["api"]["values"]]
+    reference = anna.get(f"{UR5}/scripting").json()
+    assert "elbow" in reference["names"]["joints"]
+    assert "robot" in [each["name"] for each in reference["api"]["values"]]
     problem(anna.get("/robot-types/nothing/scripting"), 404, "robot-type-unknown")
     problem(anna.post("/robot-types/nothing/scripting/check", {"source": ""}), 404, "robot-type-unknown")
 
@@ -126,8 +126,8 @@ def test_an_accepted_script_fits_into_a_command_with_parameters(alone: Cloud, an
     for source in ("# ".ljust(MAX_SOURCE), "# ".ljust(48_000, "ü"), "\n" * 48_000, '#"' * 24_000):
         assert anna.put(MINE, {"source": source}).status_code in {200, 201}
         assert anna.get(MINE).json()["source"] == source
-        asked = {"kind": "run_movement", "name": "mine", "parameters": {"text": text}}
-        assert anna.start(alone.robot().pair(anna), request=asked).status_code == 202
+        request = {"kind": "run_movement", "name": "mine", "parameters": {"text": text}}
+        assert anna.start(alone.robot().pair(anna), request=request).status_code == 202
 
 
 @pytest.mark.parametrize("letter", ["🤖", "ü", "\x01", '"'])
@@ -157,10 +157,10 @@ def test_a_script_modified_in_the_store_is_not_run(alone: Cloud, memory: Memory)
 
 def test_version_numbers_increase_over_built_in_and_own_movements(anna: Person, robot: Robot, tmp_path: Path) -> None:
     robot.reports = lambda _: (AckStatus.DONE,)
-    asked = {"kind": "run_movement", "name": "wave"}
+    request = {"kind": "run_movement", "name": "wave"}
 
     def run() -> None:
-        anna.start(robot.device, request=asked, wait_ms=10_000, wait_for="done")
+        anna.start(robot.device, request=request, wait_ms=10_000, wait_for="done")
 
     run()
     built_in = anna.get(WAVE).json()["source"]
@@ -176,13 +176,13 @@ def test_version_numbers_increase_over_built_in_and_own_movements(anna: Person, 
     assert [order.source for order in orders] == [built_in, *own[:2], built_in, own[2]]
     journal = Journal(tmp_path / "journal.db")
     journal.open(now_ms=0)
-    trust = ScriptPolicy(device="arm", robot_type="ur5", owner=anna.account, keys=robot._keys, journal=journal)
+    policy = ScriptPolicy(device="arm", robot_type="ur5", owner=anna.account, keys=robot._keys, journal=journal)
     for order in orders:
-        trust.verify(order)
-        trust.record_version(order)
-        assert not trust.is_untrusted(order)
+        policy.verify(order)
+        policy.record_version(order)
+        assert not policy.is_untrusted(order)
         assert order.timeout_ms == 300_000
     with pytest.raises(Refused, match="older than version"):
-        trust.verify(orders[1])
+        policy.verify(orders[1])
     journal.close()
     assert [order.author for order in orders] == [SHIPPED, anna.account, anna.account, SHIPPED, anna.account]

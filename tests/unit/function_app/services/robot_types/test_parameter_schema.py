@@ -53,16 +53,18 @@ def outcome(call: Callable[[], Any]) -> tuple[Any, Problem | None]:
 
 
 @given(SCHEMAS, st.dictionaries(st.text(min_size=1, max_size=3), JSON, max_size=4))
-def test_accepted_parameters_are_valid_for_other_validators(properties: dict[str, Any], asked: dict[str, Any]) -> None:
+def test_accepted_parameters_are_valid_for_other_validators(
+    properties: dict[str, Any], parameters: dict[str, Any]
+) -> None:
     schema = parameter_schema.plain(parameter_schema.of_properties(properties))
     jsonschema.Draft202012Validator.check_schema(schema)
-    filled, refused = outcome(lambda: parameter_schema.fit(schema, asked))
+    filled, refused = outcome(lambda: parameter_schema.fit(schema, parameters))
     if refused is not None:
         assert (refused.code, refused.status) == ("parameters-invalid", 422)
         assert refused.extras["place"].startswith("$")
     else:
         jsonschema.validate(filled, schema)
-        assert filled.keys() >= asked.keys()
+        assert filled.keys() >= parameters.keys()
         assert parameter_schema.fit(schema, filled) == filled, "filling in twice changes nothing"
 
 

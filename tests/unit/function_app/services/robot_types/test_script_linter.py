@@ -28,7 +28,7 @@ def test_shipped_movements_have_no_messages(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "severity", "where", "said"),
+    ("source", "severity", "where", "text"),
     [
         ("robot.home()\nwait(\n", "error", (2, 4), "never closed"),
         ("PARAMETERS = {'speed': 1 + len('x')}\n", "error", (1, 0), "literal dictionary"),
@@ -46,10 +46,10 @@ def test_shipped_movements_have_no_messages(path: Path) -> None:
         ("'ü'; wiat(1)\n", "warning", (1, 5), "no 'wiat'"),
     ],
 )
-def test_errors_are_reported_at_their_place(source: str, severity: str, where: tuple[int, int], said: str) -> None:
+def test_errors_are_reported_at_their_place(source: str, severity: str, where: tuple[int, int], text: str) -> None:
     (mark,) = marks(source)
     assert (mark.severity, (mark.line, mark.column)) == (severity, where), mark
-    assert said in mark.message
+    assert text in mark.message
     assert (mark.end_line, mark.end_column) > where
 
 

@@ -155,12 +155,12 @@ def test_requests_of_a_key_that_is_revoked_concurrently_are_refused(
     name = "require_key" if what == "credentials" else "require_still_allowed"
     real = getattr(devices, name)
 
-    async def meanwhile(*given: Any) -> Any:
+    async def meanwhile(*arguments: Any) -> Any:
         # A revocation whose search for active permissions was completed before this request.
         row = await tables.get(records.API_KEYS, key, "key")
         if row is not None:
             await tables.delete(records.API_KEYS, row)
-        return await real(*given)
+        return await real(*arguments)
 
     monkeypatch.setattr(devices, name, meanwhile)
     answer = {

@@ -88,8 +88,8 @@ def test_expired_withdrawn_foreign_and_void_links_are_refused(
     assert anna.delete(f"/agents/{robot.id}").status_code == 204
     robot.pair(anna)
     for made in (late, back, void, {"secret": "guess"}):
-        told = problem(redeem(bert, made), 404, "invitation-unknown")
-        assert told == problem(bert.post("/invitations/lookup", {"secret": made["secret"]}), 404, "invitation-unknown")
+        error = problem(redeem(bert, made), 404, "invitation-unknown")
+        assert error == problem(bert.post("/invitations/lookup", {"secret": made["secret"]}), 404, "invitation-unknown")
     assert devices(bert) == {}
     cloud.clock.advance(DAY_S)
     for _ in range(3):
@@ -187,10 +187,10 @@ def test_an_acceptance_killed_after_any_write_is_completed_by_the_timer(
     assert anna.put(f"/agents/{robot.id}/space", {"space": attic}).status_code == 200
     made = invite(anna, f"/spaces/{attic}/transfers")
     process, crash = crashing(cloud.clock)
-    there = at_instance(process, bert)
-    assert there.get("/accounts/me").status_code == 200
+    client = at_instance(process, bert)
+    assert client.get("/accounts/me").status_code == 200
     crash.left = after
-    there.post("/invitations/redeem", {"secret": made["secret"]})
+    client.post("/invitations/redeem", {"secret": made["secret"]})
     cloud.clock.advance(11)
     cloud.sweep()
     cloud.clock.advance(LOOK_MS / 1000 + 61)

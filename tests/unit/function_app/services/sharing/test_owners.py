@@ -26,8 +26,8 @@ def test_an_owner_cannot_leave_or_get_a_lower_role(anna: Person, bert: Person, r
     at = f"/{kind}/{robot.device if kind == 'devices' else robot.space}/shares"
     left = problem(anna.delete(f"{at}/{anna.account}"), 409, "already-owner")
     lowered = problem(anna.post(at, {"account": "anna", "role": "viewer"}), 422, "invalid")
-    for told in (left, lowered):
-        assert "transfer" in told["detail"].lower()
+    for error in (left, lowered):
+        assert "transfer" in error["detail"].lower()
     assert bert.delete(f"{at}/{anna.account}").status_code in {403, 404}
     stands(anna, bert, robot)
 
@@ -40,9 +40,9 @@ def test_unknown_accounts_are_refused(anna: Person, bert: Person, robot: Robot) 
         (f"/devices/{robot.device}/invitations", {"role": "viewer"}),
         (f"/devices/{robot.device}/shares", {"role": "viewer"}),
     ):
-        told = problem(anna.post(path, {"account": "unknown", **body}), 404, "account-unknown")
-        assert "'unknown'" in told["detail"]
-        assert "invitation" in told["detail"], "the error names the alternative"
+        error = problem(anna.post(path, {"account": "unknown", **body}), 404, "account-unknown")
+        assert "'unknown'" in error["detail"]
+        assert "invitation" in error["detail"], "the error names the alternative"
     assert anna.get(f"/agents/{robot.id}/transfers").json()["items"] == []
     stands(anna, bert, robot)
 
@@ -68,8 +68,8 @@ def test_the_last_space_cannot_be_transferred(anna: Person, bert: Person, robot:
     second = anna.post("/spaces", {"name": "second"}).json()["id"]
     offers = [anna.post(f"/spaces/{space}/transfers", {}).json() for space in (second, robot.space)]
     assert bert.post("/invitations/redeem", {"secret": offers[0]["secret"]}).status_code == 200
-    told = problem(bert.post("/invitations/redeem", {"secret": offers[1]["secret"]}), 409, "last-space")
-    assert "anna" in told["detail"]
+    error = problem(bert.post("/invitations/redeem", {"secret": offers[1]["secret"]}), 409, "last-space")
+    assert "anna" in error["detail"]
     stands(anna, bert, robot)
     anna.post("/spaces", {"name": "third"})
     assert bert.post("/invitations/redeem", {"secret": offers[1]["secret"]}).status_code == 200

@@ -21,8 +21,8 @@ def test_viewing_credentials_of_a_shared_device_cover_only_that_device(
         issued = bert.post("/mqtt/credentials", {"purpose": "view"}).json()
         base = f"ts/v1/{second.space}/{second.id}/arm"
         classes = ("desc", "desc/twin", "state", "tele/+", "cam/+", "event", "ack")
-        wanted = {topics.conn(second.space, second.id), *(f"{base}/{kind}" for kind in classes)}
-        assert set(issued["subscribe"]) == wanted
+        expected = {topics.conn(second.space, second.id), *(f"{base}/{kind}" for kind in classes)}
+        assert set(issued["subscribe"]) == expected
         assert issued["publish"] == [f"{base}/stop"]
         with connected(broker, bert) as page:
             assert page.subscribe(*issued["subscribe"][:8]) == [1] * 8
@@ -125,7 +125,7 @@ def test_a_share_extended_while_it_expires_remains(
 ) -> None:
     share(anna, f"devices/{robot.device}", bert, "operator", expires_in_s=SHARED_S)
     cloud.clock.advance(SHARED_S)
-    sharing, who = cloud.functions.sharing, Identity(anna.account, anna.name, anna.session)
+    sharing, caller = cloud.functions.sharing, Identity(anna.account, anna.name, anna.session)
     real = sharing._reminders.schedule
     times = 0
 
@@ -133,8 +133,8 @@ def test_a_share_extended_while_it_expires_remains(
         nonlocal times
         times += 1
         if times == 1:
-            shared = await sharing.of(who, "device", robot.device)
-            await sharing.put(who, shared, await sharing.person("bert"), Role.OPERATOR, None)
+            shared = await sharing.of(caller, "device", robot.device)
+            await sharing.put(caller, shared, await sharing.person("bert"), Role.OPERATOR, None)
         return await real(what, due_ms)
 
     monkeypatch.setattr(sharing._reminders, "schedule", meanwhile)

@@ -72,8 +72,8 @@ def test_shared_devices_are_listed_after_own_ones(cloud: Cloud, anna: Person, be
     with paired(cloud, "bert", "one", "two") as (_, own), paired(cloud, "anna") as (_, second):
         for device in (robot.device, second.device):
             share(anna, f"devices/{device}", bert, "viewer")
-        wanted = dict.fromkeys(own.devices, "owner") | {robot.device: "viewer", second.device: "viewer"}
-        assert devices(bert) == wanted
+        expected = dict.fromkeys(own.devices, "owner") | {robot.device: "viewer", second.device: "viewer"}
+        assert devices(bert) == expected
         assert len(bert.each_page("/devices")) == 1
         assert devices(anna) == {robot.device: "owner", second.device: "owner"}
 

@@ -1,4 +1,4 @@
-"""What is no longer needed goes, when its time has come and not before; what was renewed stays."""
+"""Rows and blobs are deleted when due, unless they were renewed."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ def left(cloud: Cloud, table: str = "Things", partition: str = "p") -> list[str]
 
 
 def notes(cloud: Cloud, table: str = "") -> list[str]:
-    """Notes, or those about rows of one table: the silence of a robot is remembered too."""
+    """Keys of scheduled deletions, optionally of one table only."""
     pages = [cloud.run(cloud.functions.tables.query(records.FORGET, str(shard), limit=1000)) for shard in range(SHARDS)]
     return [row.key for page in pages for row in page.rows if table in {"", row.data.get("table")}]
 
@@ -55,7 +55,7 @@ class TestRows:
         for _ in range(2):
             alone.run(alone.functions.retention.delete_row_at("Things", "p", "x", due_ms=NOW_MS))
         delete_later(alone, "y")
-        assert len(notes(alone)) == 3, "the same note twice is one"
+        assert len(notes(alone)) == 3, "scheduling is idempotent"
         run(alone, NOW_MS - 1)
         assert left(alone) == ["a", "b", "b1", "c", "x", "x1", "y", "zzz"]
         run(alone)
@@ -76,8 +76,8 @@ class TestRows:
         put(alone, *(f"a{number:04d}" for number in range(ROWS)), expires_ms=NOW_MS + 1)
         put(alone, *(f"b{number:04d}" for number in range(ROWS + 1)))
         delete_later(alone)
-        for looked in (0, ROWS, 2 * ROWS):
-            assert len(left(alone)) == 2 * ROWS + 1 - max(0, looked - ROWS)
+        for processed in (0, ROWS, 2 * ROWS):
+            assert len(left(alone)) == 2 * ROWS + 1 - max(0, processed - ROWS)
             assert len(notes(alone)) == 1
             run(alone)
         assert len(left(alone)) == ROWS
@@ -103,7 +103,7 @@ class TestRows:
         tables, inner = alone.functions.tables, alone.functions.tables.batch
 
         class Changing:
-            """The same tables, where a row is renewed between reading and deleting it."""
+            """Tables that renew a row between reading and deleting it."""
 
             def __getattr__(self, name: str) -> Any:
                 return getattr(tables, name)
@@ -127,7 +127,7 @@ def test_a_blob_is_deleted_when_due_and_a_missing_blob_is_ignored(alone: Cloud) 
     blobs = alone.functions.blobs
     alone.run(blobs.put("a/b", b"content"))
     alone.run(alone.functions.retention.delete_blob_at("a/b", due_ms=NOW_MS))
-    alone.run(alone.functions.retention.delete_blob_at("never/there", due_ms=NOW_MS))
+    alone.run(alone.functions.retention.delete_blob_at("missing/blob", due_ms=NOW_MS))
     run(alone, NOW_MS - 1)
     assert alone.run(blobs.get("a/b")) == b"content"
     run(alone)
@@ -135,7 +135,7 @@ def test_a_blob_is_deleted_when_due_and_a_missing_blob_is_ignored(alone: Cloud) 
     assert notes(alone) == []
 
 
-def test_an_action_is_kept_for_30_days_after_its_end_and_its_key_for_one(
+def test_an_action_is_kept_for_30_days_after_its_end_and_its_key_for_one_day(
     cloud: Cloud, anna: Person, robot: Robot
 ) -> None:
     action = anna.start(robot.device, idempotency_key="k", wait_ms=10_000).json()["id"]
@@ -176,7 +176,7 @@ def test_events_are_kept_for_90_days_with_one_deletion_per_day(cloud: Cloud, ann
         event = Event(id=f"e{number}", device="arm", kind="door", severity="info", at_ms=now_ms, message="open")
         robot.publish(robot.topic(topics.EVENT), event)
     assert events() == 5
-    assert len(notes(cloud)) - before <= 2, "two, where midnight falls between"
+    assert len(notes(cloud)) - before <= 2, "two around midnight"
     run(cloud, now_ms + KEEP_EVENTS_MS - DAY_MS)
     assert events() == 5
     run(cloud, now_ms + KEEP_EVENTS_MS + 2 * DAY_MS)

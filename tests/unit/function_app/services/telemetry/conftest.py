@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.unit.function_app.services.telemetry.house import House
+from tests.unit.function_app.services.telemetry.telemetry_fixture import TelemetrySetup
 
 
 @pytest.fixture
@@ -14,8 +14,8 @@ def anyio_backend() -> str:
 
 
 @pytest.fixture
-async def house(tmp_path: Path) -> AsyncIterator[House]:
-    house = House(tmp_path)
-    await house.pair()
-    yield house
-    await house.tables.close()
+async def setup(tmp_path: Path) -> AsyncIterator[TelemetrySetup]:
+    setup = TelemetrySetup(tmp_path)
+    await setup.pair()
+    yield setup
+    await setup.tables.close()

@@ -1,4 +1,4 @@
-"""Only accounts with access to a device can read its events, page by page."""
+"""Events of a device are listed in pages, to authorized accounts only."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from tests.harness.cloud.cloud import Cloud, Person, problem
 Pair = tuple[Person, Robot]
 
 
-def happened(cloud: Cloud, robot: Robot, number: int, **changes: Any) -> None:
+def ingest_event(cloud: Cloud, robot: Robot, number: int, **changes: Any) -> None:
     fields: dict[str, Any] = {
         "id": f"e{number}",
         "device": "arm",
@@ -27,7 +27,7 @@ def happened(cloud: Cloud, robot: Robot, number: int, **changes: Any) -> None:
 
 def test_events_are_listed_newest_first_with_both_times(cloud: Cloud, anna: Person, robot: Robot) -> None:
     for number in (2, 0, 3, 1, 4, 4):
-        happened(cloud, robot, number)
+        ingest_event(cloud, robot, number)
     pages = anna.each_page(f"/devices/{robot.device}/events", limit=2)
     assert max(map(len, pages)) <= 2
     shown = [event for page in pages for event in page]
@@ -42,7 +42,7 @@ def test_events_are_listed_newest_first_with_both_times(cloud: Cloud, anna: Pers
 def test_a_later_owner_reads_no_earlier_data(cloud: Cloud, anna: Person, robot: Robot) -> None:
     cloud.start_telemetry()
     at, now_ms = f"/devices/{robot.device}", cloud.clock.now_ms()
-    happened(cloud, robot, 1)
+    ingest_event(cloud, robot, 1)
     latency = {"transport": "mqtt", "path": "operator-device", "samples": [{"at_ms": now_ms, "ms": 5.0}]}
     assert anna.post(f"{at}/latency", latency).status_code == 204
     measured = codec.encode(Measurements(tick_ms=1, at_ms=now_ms, sequence=1, values={"a": 1.0}))
@@ -54,10 +54,10 @@ def test_a_later_owner_reads_no_earlier_data(cloud: Cloud, anna: Person, robot: 
     robot.pair(bert)
     assert [bert.get(path).json()["items"] for path in lists] == [[], [], []]
     problem(bert.get(f"{at}/data/health"), 404, "stream-unknown")
-    happened(cloud, robot, 2)
+    ingest_event(cloud, robot, 2)
     assert [event["id"] for event in bert.get(f"{at}/events").json()["items"]] == ["e2"]
 
 
 def test_an_event_with_an_invalid_time_is_dropped(cloud: Cloud, anna: Person, robot: Robot) -> None:
-    happened(cloud, robot, 1, at_ms=2**52)
+    ingest_event(cloud, robot, 1, at_ms=2**52)
     assert anna.get(f"/devices/{robot.device}/events").json()["items"] == []

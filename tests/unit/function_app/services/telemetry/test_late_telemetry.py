@@ -1,4 +1,4 @@
-"""What was measured while a link was down reaches the series by its own time, never a live view."""
+"""Backfilled measurements of an interrupted connection are stored and not relayed to live views."""
 
 import asyncio
 import math
@@ -48,28 +48,28 @@ def test_samples_over_http_are_stored_and_not_relayed(cloud: Cloud, broker: Memo
     with PollingRobot(cloud) as robot:
         robot.pair(anna)
         live = topics.device(robot.space, robot.id, "arm", topics.TELE, "health")
-        told = [(late(robot), codec.encode(sample(cloud, 1))), (live, codec.encode(sample(cloud, 2)))]
+        messages = [(late(robot), codec.encode(sample(cloud, 1))), (live, codec.encode(sample(cloud, 2)))]
         own = cloud.functions.mqtt_credentials._access.service_credentials()
         login = Credentials(own.username, own.password)
-        with broker.connect(own.client_id, login) as ear:
-            ear.subscribe(late(robot), live)
-            assert [result["status"] for result in robot.post_raw(*told).json()["results"]] == ["stored"] * 2
-            assert ear.receive().topic == live
-            assert ear.pending() == []
+        with broker.connect(own.client_id, login) as subscriber:
+            subscriber.subscribe(late(robot), live)
+            assert [result["status"] for result in robot.post_raw(*messages).json()["results"]] == ["stored"] * 2
+            assert subscriber.receive().topic == live
+            assert subscriber.pending() == []
         assert stored(anna, robot.device) == 2
 
 
 def test_ingest_is_retried_until_the_store_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_feed, "COLLECT_S", 0.01)
-    tries: list[int] = []
+    batches: list[int] = []
 
-    async def away(batch: Any) -> None:
-        tries.append(len(batch))
-        if len(tries) < 20:
-            raise StoreError("the store is away")
+    async def store(batch: Any) -> None:
+        batches.append(len(batch))
+        if len(batches) < 20:
+            raise StoreError("the store is not available")
 
     feed = device_feed.MqttTelemetryFeed(
         Broker(host="127.0.0.1", port=1, credentials=lambda: ServiceCredentials("", "", "", math.inf)), late=True
     )
-    asyncio.run(feed.store([("t", b"")], away))
-    assert tries == [1] * 20
+    asyncio.run(feed.store([("t", b"")], store))
+    assert batches == [1] * 20

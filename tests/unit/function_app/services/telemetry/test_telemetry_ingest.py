@@ -1,4 +1,4 @@
-"""Ingested measurements: stored once, for their owner only."""
+"""Measurements are stored once, and for the current owner only."""
 
 from typing import Any
 
@@ -13,44 +13,52 @@ from function_app.domain.telemetry.series import Samples
 from function_app.services.storage import records
 from function_app.services.telemetry.ingest import GIVE_UP_MS, LEFT_MS, SHARDS, InboundMessage, _Part
 from tests.harness.crash_injection import Killed
-from tests.unit.function_app.services.telemetry.house import AGENT, ANNA, DEVICE, NOW_MS, House, assert_whole, message
+from tests.unit.function_app.services.telemetry.telemetry_fixture import (
+    AGENT,
+    ANNA,
+    DEVICE,
+    NOW_MS,
+    TelemetrySetup,
+    assert_whole,
+    message,
+)
 
 pytestmark = pytest.mark.anyio
 
 
-async def test_measurements_of_claimed_devices_are_stored(house: House) -> None:
+async def test_measurements_of_claimed_devices_are_stored(setup: TelemetrySetup) -> None:
     rows = {NOW_MS - 100 * n: {"temperature_c.elbow": 40.0 + n, "fan": 1.0} for n in range(50)}
     arrived = [message(at_ms, "health", **values) for at_ms, values in rows.items()]
-    await house.intake.ingest(arrived)
-    await house.intake.ingest(arrived[10:20])
-    await assert_whole(house, rows)
+    await setup.ingest.ingest(arrived)
+    await setup.ingest.ingest(arrived[10:20])
+    await assert_whole(setup, rows)
     for shard in range(SHARDS):
-        assert not (await house.tables.query(records.DATA, str(shard))).rows
-    (seen,) = house.seen
-    assert seen[:2] == (DEVICE, "health")
-    assert [set(values) for _, values in seen[2]] == [{"temperature_c.elbow", "fan"}] * len(seen[2])
-    assert seen[2][-1][0] == NOW_MS
+        assert not (await setup.tables.query(records.DATA, str(shard))).rows
+    ((device, stream, means),) = setup.observed
+    assert (device, stream) == (DEVICE, "health")
+    assert [set(values) for _, values in means] == [{"temperature_c.elbow", "fan"}] * len(means)
+    assert means[-1][0] == NOW_MS
 
 
-async def test_joints_are_stored_under_their_names(house: House) -> None:
+async def test_joints_are_stored_under_their_names(setup: TelemetrySetup) -> None:
     names = ("shoulder", "élbow", "wrist")
     limits: dict[str, Any] = {"lower_rad": 0, "upper_rad": 1, "max_effort_nm": 1}
     limits |= {"max_velocity_rad_s": 1, "max_acceleration_rad_s2": 1, "max_jerk_rad_s3": 1}
     joints = tuple(Joint(name=name, label="", **limits) for name in names)
     description = Description(device="arm", kind="arm", robot_type="ur5", label="Arm", joints=joints)
-    await records.upsert(house.tables, records.DESCRIPTIONS, AGENT, "arm", lambda _: description, Description)
+    await records.upsert(setup.tables, records.DESCRIPTIONS, AGENT, "arm", lambda _: description, Description)
     telemetry = JointTelemetry(
         tick_ms=1, at_ms=NOW_MS, sequence=1, mode=Mode.STREAMING, position_rad=(0.1, 0.2, 0.3, 0.4),
         velocity_rad_s=(1.0, 2.0, 3.0, 4.0), effort_nm=(5.0,), commanded_rad=(), loop_age_ms=12.0,
     )  # fmt: skip
-    await house.intake.ingest(
+    await setup.ingest.ingest(
         [InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "joints"), codec.encode(telemetry))]
     )
     expected = {"loop_age_ms": 12.0, "effort_nm.shoulder": 5.0}
     for index, name in enumerate(("shoulder", "1", "wrist", "3")):
         expected[f"position_rad.{name}"] = (0.1, 0.2, 0.3, 0.4)[index]
         expected[f"velocity_rad_s.{name}"] = index + 1.0
-    await assert_whole(house, {NOW_MS: expected}, "joints")
+    await assert_whole(setup, {NOW_MS: expected}, "joints")
 
 
 @pytest.mark.parametrize(
@@ -61,9 +69,9 @@ async def test_joints_are_stored_under_their_names(house: House) -> None:
         Topic("space", "klmnopqrst", "arm", topics.TELE, "health"),
     ],
 )
-async def test_messages_without_a_claimed_device_are_dropped(house: House, topic: Topic) -> None:
-    await house.intake.ingest([InboundMessage(topic, message(NOW_MS, a=1.0).payload)])
-    assert await house.reader.streams(ANNA, DEVICE) == []
+async def test_messages_without_a_claimed_device_are_dropped(setup: TelemetrySetup, topic: Topic) -> None:
+    await setup.ingest.ingest([InboundMessage(topic, message(NOW_MS, a=1.0).payload)])
+    assert await setup.reader.streams(ANNA, DEVICE) == []
 
 
 @pytest.mark.parametrize(
@@ -78,79 +86,79 @@ async def test_messages_without_a_claimed_device_are_dropped(house: House, topic
         ),
     ],
 )
-async def test_an_invalid_message_does_not_affect_the_others(house: House, payload: bytes) -> None:
-    bad = InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "health"), payload)
-    await house.intake.ingest([bad, message(NOW_MS, a=1.0), bad])
-    await assert_whole(house, {NOW_MS: {"a": 1.0}})
+async def test_an_invalid_message_does_not_affect_the_others(setup: TelemetrySetup, payload: bytes) -> None:
+    invalid = InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "health"), payload)
+    await setup.ingest.ingest([invalid, message(NOW_MS, a=1.0), invalid])
+    await assert_whole(setup, {NOW_MS: {"a": 1.0}})
 
 
-async def test_queued_samples_are_not_visible_to_the_next_owner(house: House) -> None:
-    device = (await house.intake._agent(AGENT)).devices["arm"]
-    await house.intake._queue([_Part(device, "health", series.from_rows([(NOW_MS, {"a": 1.0})]))])
-    await house.pair(pairing="p2", account="bert")
-    house.clock.at_ms += LEFT_MS + 1
+async def test_queued_samples_are_not_visible_to_the_next_owner(setup: TelemetrySetup) -> None:
+    device = (await setup.ingest._agent(AGENT)).devices["arm"]
+    await setup.ingest._queue([_Part(device, "health", series.from_rows([(NOW_MS, {"a": 1.0})]))])
+    await setup.pair(pairing="p2", account="bert")
+    setup.clock.at_ms += LEFT_MS + 1
     for _ in range(SHARDS):
-        await house.intake.distribute_backlog()
-    assert await _queued(house) == 0
-    assert await house.reader.streams(Identity("bert", "bert", "s2"), DEVICE) == []
+        await setup.ingest.distribute_backlog()
+    assert await _queued(setup) == 0
+    assert await setup.reader.streams(Identity("bert", "bert", "s2"), DEVICE) == []
 
 
-async def test_a_failing_observer_does_not_affect_the_ingest(house: House) -> None:
+async def test_a_failing_observer_does_not_affect_the_ingest(setup: TelemetrySetup) -> None:
     async def fail(*_: Any) -> None:
         raise RuntimeError("no")
 
-    house.intake._observers = (fail, house.observe)
-    await house.intake.ingest([message(NOW_MS, a=1.0)])
-    assert len(house.seen) == 1
+    setup.ingest._observers = (fail, setup.observe)
+    await setup.ingest.ingest([message(NOW_MS, a=1.0)])
+    assert len(setup.observed) == 1
 
 
-async def test_a_kill_between_any_two_writes_neither_loses_nor_duplicates_samples(house: House) -> None:
+async def test_a_kill_between_any_two_writes_neither_loses_nor_duplicates_samples(setup: TelemetrySetup) -> None:
     kills = 0
     for number in range(10):
         stream = f"s{number}"
-        rows = {house.clock.at_ms - 3_000 * n: {"a": float(n)} for n in range(10)}
-        house.crash.left = number
+        rows = {setup.clock.at_ms - 3_000 * n: {"a": float(n)} for n in range(10)}
+        setup.crash.left = number
         try:
-            await house.intake.ingest([message(at_ms, stream, **values) for at_ms, values in rows.items()])
+            await setup.ingest.ingest([message(at_ms, stream, **values) for at_ms, values in rows.items()])
         except Killed:
             kills += 1
-        house.crash.left = None
+        setup.crash.left = None
         if number == 0:
-            continue  # nothing was written at all: the broker, or the caller, has it still
-        house.clock.at_ms += LEFT_MS + 1
-        _, intake, _, _ = house.instance()
+            continue  # nothing was written: the sender delivers the messages again
+        setup.clock.at_ms += LEFT_MS + 1
+        _, ingest, _, _ = setup.instance()
         for _ in range(SHARDS):
-            await intake.distribute_backlog()
-        assert await _queued(house) == 0
-        await assert_whole(house, rows, stream)
+            await ingest.distribute_backlog()
+        assert await _queued(setup) == 0
+        await assert_whole(setup, rows, stream)
     assert kills > 5
 
 
-async def _queued(house: House) -> int:
-    return sum([len((await house.tables.query(records.DATA, str(shard))).rows) for shard in range(SHARDS)])
+async def _queued(setup: TelemetrySetup) -> int:
+    return sum([len((await setup.tables.query(records.DATA, str(shard))).rows) for shard in range(SHARDS)])
 
 
-async def test_samples_that_cannot_be_distributed_are_dropped(house: House) -> None:
-    await house.intake.ingest([])
-    _, intake, _, _ = house.instance()
-    device = (await intake._agent(AGENT)).devices["arm"]
-    await intake._queue([_Part(device, "health", series.from_rows([(NOW_MS, {"a": 1.0})]))])
+async def test_samples_that_cannot_be_distributed_are_dropped(setup: TelemetrySetup) -> None:
+    await setup.ingest.ingest([])
+    _, ingest, _, _ = setup.instance()
+    device = (await ingest._agent(AGENT)).devices["arm"]
+    await ingest._queue([_Part(device, "health", series.from_rows([(NOW_MS, {"a": 1.0})]))])
 
     async def busy(*_: Any) -> Samples:
         raise Problem("busy", 503, "Busy", "Try again.")
 
-    intake._writer.add = busy  # type: ignore[assignment, method-assign]
+    ingest._writer.add = busy  # type: ignore[assignment, method-assign]
     for later_ms, left in ((LEFT_MS + 1, 1), (GIVE_UP_MS + 1, 0)):
-        house.clock.at_ms = NOW_MS + later_ms
+        setup.clock.at_ms = NOW_MS + later_ms
         for _ in range(SHARDS):
-            await intake.distribute_backlog()
-        assert await _queued(house) == left
+            await ingest.distribute_backlog()
+        assert await _queued(setup) == left
 
 
-async def test_an_unavailable_store_raises_and_the_same_messages_can_be_stored_later(house: House) -> None:
-    house.crash.left = 1
+async def test_an_unavailable_store_raises_and_the_same_messages_can_be_stored_later(setup: TelemetrySetup) -> None:
+    setup.crash.left = 1
     with pytest.raises(Killed):
-        await house.intake.ingest([message(NOW_MS, a=1.0)])
-    house.crash.left = None
-    await house.intake.ingest([message(NOW_MS, a=1.0)])
-    await assert_whole(house, {NOW_MS: {"a": 1.0}})
+        await setup.ingest.ingest([message(NOW_MS, a=1.0)])
+    setup.crash.left = None
+    await setup.ingest.ingest([message(NOW_MS, a=1.0)])
+    await assert_whole(setup, {NOW_MS: {"a": 1.0}})

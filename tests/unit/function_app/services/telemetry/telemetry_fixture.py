@@ -29,7 +29,7 @@ DEVICE = f"{AGENT}-arm"
 ANNA = Identity("anna", "anna", "s1")
 PLACE = Place(DEVICE, "p1", "health")
 NOW_MS = 1_800_000_000_000
-"""Some moment; not the beginning of a day."""
+"""A time that is not the beginning of a day."""
 
 
 class Clock:
@@ -40,26 +40,26 @@ class Clock:
         return self.at_ms
 
 
-class House:
-    """The services over SQLite, and one agent with an arm that is Anna's."""
+class TelemetrySetup:
+    """The telemetry services with SQLite tables, and an agent of Anna with one arm."""
 
     def __init__(self, folder: Path) -> None:
         self.clock = Clock()
         self.keep = RetentionPolicy()
         self.crash = CrashPoint()
         self.tables: Any = crashing_tables(SqliteTables(folder / "tables.sqlite"), self.crash)
-        self.seen: list[tuple[str, str, Sequence[tuple[int, Values]]]] = []
-        self.reader, self.intake, self.writer, self.forget = self.instance()
+        self.observed: list[tuple[str, str, Sequence[tuple[int, Values]]]] = []
+        self.reader, self.ingest, self.writer, self.retention = self.instance()
 
     def instance(self) -> tuple[SeriesReader, TelemetryIngest, SeriesWriter, Retention]:
         stores: dict[str, Any] = {"tables": self.tables, "clock": self.clock}
-        forget = Retention(tables=self.tables, blobs=MemoryBlobs(now_s=lambda: 0.0))
-        writer = SeriesWriter(retention=forget, keep=self.keep, **stores)
-        intake = TelemetryIngest(writer=writer, observers=[self.observe], **stores)
-        return SeriesReader(devices=DeviceAccess(**stores), keep=self.keep, **stores), intake, writer, forget
+        retention = Retention(tables=self.tables, blobs=MemoryBlobs(now_s=lambda: 0.0))
+        writer = SeriesWriter(retention=retention, keep=self.keep, **stores)
+        ingest = TelemetryIngest(writer=writer, observers=[self.observe], **stores)
+        return SeriesReader(devices=DeviceAccess(**stores), keep=self.keep, **stores), ingest, writer, retention
 
     async def observe(self, device: Device, stream: str, means: Sequence[tuple[int, Values]]) -> None:
-        self.seen.append((device.id, stream, means))
+        self.observed.append((device.id, stream, means))
 
     async def pair(self, *, pairing: str = "p1", account: str = "anna") -> None:
         agent = Agent(
@@ -75,8 +75,8 @@ class House:
         )
         await records.upsert(self.tables, records.AGENTS, AGENT, "agent", lambda _: agent, Agent)
 
-    async def read(self, stream: str = "health", **wanted: Any) -> Part:
-        return await self.reader.read(ANNA, DEVICE, stream, Range(**wanted))
+    async def read(self, stream: str = "health", **options: Any) -> Part:
+        return await self.reader.read(ANNA, DEVICE, stream, Range(**options))
 
 
 def message(at_ms: int, stream: str = "health", /, **values: float) -> InboundMessage:
@@ -84,26 +84,26 @@ def message(at_ms: int, stream: str = "health", /, **values: float) -> InboundMe
     return InboundMessage(Topic("space", AGENT, "arm", topics.TELE, stream), codec.encode(body))
 
 
-async def assert_whole(house: House, rows: dict[int, dict[str, float]], stream: str = "health") -> None:
-    """Every level of the series holds exactly these samples."""
-    (view,) = [view for view in await house.reader.streams(ANNA, DEVICE) if view.name == stream]
+async def assert_whole(setup: TelemetrySetup, rows: dict[int, dict[str, float]], stream: str = "health") -> None:
+    """Check that every level of the series contains exactly these samples."""
+    (view,) = [view for view in await setup.reader.streams(ANNA, DEVICE) if view.name == stream]
     assert view.about.count == len(rows)
     assert (view.about.first_ms, view.about.last_ms) == (min(rows), max(rows))
     names = {name for values in rows.values() for name in values}
     assert set(view.about.fields) == names
-    found: dict[int, dict[str, float]] = {}
+    stored: dict[int, dict[str, float]] = {}
     cursor: str | None = None
     while True:
-        part = await house.read(stream, level="raw", points=1000, cursor=cursor)
+        part = await setup.read(stream, level="raw", points=1000, cursor=cursor)
         for index, at_ms in enumerate(part.at_ms):
-            assert at_ms not in found
-            found[at_ms] = {name: value for name in names if (value := part.values[name][index]) is not None}
+            assert at_ms not in stored
+            stored[at_ms] = {name: value for name in names if (value := part.values[name][index]) is not None}
         cursor = part.cursor
         if cursor is None:
             break
-    assert found == rows
+    assert stored == rows
     for level in LEVELS:
-        part = await house.read(stream, level=level.name, points=1000)
+        part = await setup.read(stream, level=level.name, points=1000)
         assert part.cursor is None
         starts = sorted({series.floor(at_ms, level.span_ms) for at_ms in rows})
         assert part.at_ms == starts
