@@ -23,12 +23,12 @@ from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import DAY_MS, Retention
 
-MOST: Final = 50
+MAX_KEYS: Final = 50
 """Approximate maximum per account: concurrent requests may exceed it by one."""
 SHOWN_MS: Final = 30 * DAY_MS
 """Time that an expired key remains in the list, so that users see why a program stopped."""
 USED_EVERY_MS: Final = 3_600_000
-_KNOWN: Final = 4096
+_CACHE_SIZE: Final = 4096
 _INDEX: Final = "api-key:"
 REMINDER: Final = "key-expires"
 """Kind of the reminders that a key expires."""
@@ -76,34 +76,34 @@ class ApiKeys:
         self._retention = retention
         self._reminders = reminders
         self._clock = clock
-        self._known: OrderedDict[str, _Checked] = OrderedDict()
+        self._cache: OrderedDict[str, _Checked] = OrderedDict()
 
-    async def make(self, caller: Identity, wanted: ApiKeyRequest) -> tuple[ApiKey, str]:
+    async def make(self, caller: Identity, request: ApiKeyRequest) -> tuple[ApiKey, str]:
         """Create a key; also return its token, which is shown only once.
 
         Raises:
             Problem: ``too-many-keys``; ``device-unknown``, ``space-unknown``: a target of ``only`` does not exist.
         """
-        if wanted.most is Role.OWNER:
+        if request.most is Role.OWNER:
             raise invalid("An API key has the role operator or viewer. Only a signed-in person can be owner.")
-        if not 1 <= wanted.days <= rules.MOST_DAYS:
+        if not 1 <= request.days <= rules.MOST_DAYS:
             raise invalid(f"An API key is valid for 1 to {rules.MOST_DAYS} days. Create another one after that.")
-        if len(await self._ids(caller.account)) >= MOST:
-            detail = f"An account has at most {MOST} API keys. Revoke an unused one."
+        if len(await self._ids(caller.account)) >= MAX_KEYS:
+            detail = f"An account has at most {MAX_KEYS} API keys. Revoke an unused one."
             raise Problem("too-many-keys", 409, "Too many API keys", detail)
-        only = tuple(dict.fromkeys(wanted.only))
-        await self._require_there(caller, only)
+        only = tuple(dict.fromkeys(request.only))
+        await self._require_targets(caller, only)
         now_ms, secret = self._clock.now_ms(), new_secret()
         key = ApiKey(
             id=rules.new_key_id(),
             account=caller.account,
             owner=caller.name,
-            label=wanted.label,
+            label=request.label,
             hash=rules.hashed(secret),
-            most=wanted.most,
+            most=request.most,
             only=only,
             created_ms=now_ms,
-            expires_ms=now_ms + wanted.days * DAY_MS,
+            expires_ms=now_ms + request.days * DAY_MS,
         )
         # Deletion is scheduled first, and the key is listed before it is valid.
         due_ms = key.expires_ms + SHOWN_MS
@@ -114,7 +114,7 @@ class ApiKeys:
         async with self._audit_log.change(
             caller.account, AccountEvent.API_KEY_MADE, caller, on=f"key:{key.id}", **about
         ) as change:
-            await change.noted()
+            await change.store_pending()
             await self._tables.create(records.MEMBERS, Row(caller.account, _INDEX + key.id, {}))
             await self._tables.create(records.API_KEYS, Row(key.id, API_KEY, records.to_data(key)))
         return key, rules.token(key.id, secret)
@@ -126,26 +126,26 @@ class ApiKeys:
         return tuple(sorted((key for key in result if key.account == account), key=lambda key: -key.created_ms))
 
     async def revoke(self, caller: Identity, key_id: str) -> None:
-        """Revoke a key, at once here and within seconds elsewhere, with its sessions. Raises ``api-key-unknown``."""
+        """Revoke a key and its sessions: here immediately, elsewhere within seconds. Raises ``api-key-unknown``."""
         row, key = await records.find(self._tables, records.API_KEYS, key_id, API_KEY, ApiKey)
         if row is None or key is None or key.account != caller.account:
             raise not_found("api-key", key_id)
         async with self._audit_log.change(
             caller.account, AccountEvent.API_KEY_REVOKED, caller, on=f"key:{key_id}"
         ) as change:
-            await change.noted()
+            await change.store_pending()
             try:
                 await self._tables.delete(records.API_KEYS, row)
             except Conflict:
-                change.came_to_nothing = True  # used or revoked concurrently
+                change.discarded = True  # used or revoked concurrently
         if await self._tables.get(records.API_KEYS, key_id, API_KEY) is not None:
             await self.revoke(caller, key_id)
             return
-        self._known.pop(key_id, None)
+        self._cache.pop(key_id, None)
         await self._sign_out.end(key.identity)
         await records.remove(self._tables, records.MEMBERS, caller.account, _INDEX + key_id)
 
-    async def look(self, key_id: str, note: Row) -> None:
+    async def check_expiry(self, key_id: str, note: Row) -> None:
         """Called by the timer: end the sessions and actions of an expired key."""
         _, key = await records.find(self._tables, records.API_KEYS, key_id, API_KEY, ApiKey)
         if key is not None and self._clock.now_ms() >= key.expires_ms:
@@ -158,27 +158,27 @@ class ApiKeys:
         if parts is None:
             raise unauthorized(_REFUSED)
         now_ms = self._clock.now_ms()
-        existing = self._known.get(parts[0])
+        existing = self._cache.get(parts[0])
         if existing is None or not 0 <= now_ms - existing.at_ms < RECHECK_MS:
-            existing = await self._look(parts[0], now_ms)
+            existing = await self._read_key(parts[0], now_ms)
         if existing is None or not existing.key.matches(parts[1]) or now_ms >= existing.key.expires_ms:
             raise unauthorized(_REFUSED)
         if now_ms - existing.key.used_ms >= USED_EVERY_MS:
-            existing.key = await self._used(existing.key, now_ms)
+            existing.key = await self._record_use(existing.key, now_ms)
         return existing.key.identity
 
-    async def _look(self, key_id: str, now_ms: int) -> _Checked | None:
+    async def _read_key(self, key_id: str, now_ms: int) -> _Checked | None:
         row = await self._tables.get(records.API_KEYS, key_id, API_KEY)
         if row is None:
-            self._known.pop(key_id, None)
+            self._cache.pop(key_id, None)
             return None
-        checked = self._known[key_id] = _Checked(records.read(row, ApiKey), now_ms)
-        self._known.move_to_end(key_id)
-        if len(self._known) > _KNOWN:
-            self._known.popitem(last=False)
+        checked = self._cache[key_id] = _Checked(records.read(row, ApiKey), now_ms)
+        self._cache.move_to_end(key_id)
+        if len(self._cache) > _CACHE_SIZE:
+            self._cache.popitem(last=False)
         return checked
 
-    async def _used(self, key: ApiKey, now_ms: int) -> ApiKey:
+    async def _record_use(self, key: ApiKey, now_ms: int) -> ApiKey:
         """The key, after its use was recorded; at most once an hour, best effort."""
         used = replace(key, used_ms=now_ms)
         try:
@@ -188,10 +188,10 @@ class ApiKeys:
                     records.API_KEYS, Row(row.partition, row.key, records.to_data(used), row.etag)
                 )
         except (Conflict, StoreError) as error:
-            _log.warning("the use of API key %s was not noted: %s", key.id, error)
+            _log.warning("the use of API key %s was not recorded: %s", key.id, error)
         return used
 
-    async def _require_there(self, caller: Identity, only: tuple[str, ...]) -> None:
+    async def _require_targets(self, caller: Identity, only: tuple[str, ...]) -> None:
         spaces: set[str] = set()
         if any(each.startswith("space:") for each in only):
             spaces = {space.id for space in await self._sign_in.spaces(caller.account)}

@@ -26,7 +26,7 @@ WRONG_TRIES_FROM: Final = 30
 """Per address; an address may serve many people."""
 WRONG: Final = "wrong-password"
 _PASSWORD: Final = "password"  # noqa: S105 (the key of a row)
-_NOBODY: Final = "name:"
+_NO_ACCOUNT: Final = "name:"
 """Partition without an account, so that an unknown name costs the same reads."""
 
 
@@ -60,51 +60,51 @@ class Passwords:
         self._audit_log = audit_log
         self._clock = clock
 
-    async def sign_in(self, name: str, password: str, whence: SignInOrigin) -> SignedIn:
-        """Sign in. Unknown names take the same time and response. Raises ``unauthorized`` or ``too-many-tries``."""
-        # Count by address first: after its limit, invented names create no rows.
-        counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(name): WRONG_TRIES}
+    async def sign_in(self, name: str, password: str, origin: SignInOrigin) -> SignedIn:
+        """Sign in. For unknown names, time and response are the same. Raises ``unauthorized`` or ``too-many-tries``."""
+        # Count by address first: beyond its limit, invented names create no rows.
+        counters = {**by_address(origin.address, WRONG_TRIES_FROM), named_partition(name): WRONG_TRIES}
         try:
             await self._guess_limiter.add_failure(GUESS, counters)
         except Problem as problem:
-            await self._refused("", whence, problem.code)
+            await self._refused("", origin, problem.code)
             raise
-        named = await self._sign_in.known(name)
-        account = named.id if named else ""
-        row, stored = await records.find(self._tables, records.ACCOUNTS, account or _NOBODY, _PASSWORD, _Stored)
-        right = await self._hasher.check(stored.hash if stored else None, normalize(password))
-        if named is None or row is None or stored is None or not right:
-            await self._refused(account, whence, WRONG)
+        account_of_name = await self._sign_in.known(name)
+        account = account_of_name.id if account_of_name else ""
+        row, stored = await records.find(self._tables, records.ACCOUNTS, account or _NO_ACCOUNT, _PASSWORD, _Stored)
+        valid = await self._hasher.check(stored.hash if stored else None, normalize(password))
+        if account_of_name is None or row is None or stored is None or not valid:
+            await self._refused(account, origin, WRONG)
             raise unauthorized("Name or password is wrong.")
         await self._guess_limiter.remove_failure(GUESS, counters)
-        done = await self._sessions.begin(named, "password", whence)
-        again = await self._tables.get(records.ACCOUNTS, account, _PASSWORD)
-        if again is None or records.read(again, _Stored) != stored:
-            # A concurrent change ended the sessions that it found, but not this one.
-            await self._sign_out.end(Identity(account, named.name, done.session))
+        signed_in = await self._sessions.begin(account_of_name, "password", origin)
+        current = await self._tables.get(records.ACCOUNTS, account, _PASSWORD)
+        if current is None or records.read(current, _Stored) != stored:
+            # A concurrent password change has ended all earlier sessions, but not this one.
+            await self._sign_out.end(Identity(account, account_of_name.name, signed_in.session))
             raise unauthorized("The password was changed. Sign in with the new one.")
         if self._hasher.outdated(stored.hash):
-            await self._renew(again, password)
-        return done
+            await self._renew(current, password)
+        return signed_in
 
-    async def put(self, caller: Identity, password: str, *, old: str | None, whence: SignInOrigin) -> None:
+    async def put(self, caller: Identity, password: str, *, old: str | None, origin: SignInOrigin) -> None:
         """Set or change the caller's password; all other sessions of the account end.
 
         Requires the old password, except in the first minutes after a sign-in by one-time link. An open page alone is
         not sufficient to take over the account.
         Raises ``password-not-managed-here``, ``forbidden``, ``password-weak`` or ``too-many-tries``.
         """
-        named = await self._sign_in.known(caller.name)
-        if named is None or named.id != caller.account:
+        account_of_name = await self._sign_in.known(caller.name)
+        if account_of_name is None or account_of_name.id != caller.account:
             detail = "This account signs in with a provider and has no password here. Change it at the provider."
-            raise Problem("password-not-managed-here", 409, "No password here", detail)
+            raise Problem("password-not-managed-here", 409, "No local password", detail)
         row = await self._tables.get(records.ACCOUNTS, caller.account, _PASSWORD)
-        await self._require_right(caller, row, old, whence)
+        await self._require_right(caller, row, old, origin)
         data = records.to_data(await self._store(password, caller.name))
         async with self._audit_log.change(
-            caller.account, AccountEvent.PASSWORD_SET, caller, address=whence.address
+            caller.account, AccountEvent.PASSWORD_SET, caller, address=origin.address
         ) as change:
-            await change.noted()
+            await change.store_pending()
             try:
                 if row is None:
                     await self._tables.create(records.ACCOUNTS, Row(caller.account, _PASSWORD, data))
@@ -130,7 +130,7 @@ class Passwords:
             async with self._audit_log.change(
                 account, AccountEvent.ACCOUNT_MADE, Identity(account, name, "")
             ) as change:
-                await change.noted()
+                await change.store_pending()
                 await self._tables.create(
                     records.ACCOUNTS, Row(named_partition(name), "account", new_name(account, name))
                 )
@@ -139,15 +139,13 @@ class Passwords:
             raise taken from conflict
         return await self._sign_in.account(name)
 
-    async def _refused(self, account: str, whence: SignInOrigin, code: str) -> None:
+    async def _refused(self, account: str, origin: SignInOrigin, code: str) -> None:
         """Record each failure, also of unknown names, so that they take the same time."""
         wrong = code == WRONG
-        data = {"code": code, "address": whence.address}
-        await self._audit_log.record_rejection(
-            account or CLOUD, AccountEvent.SIGN_IN_REJECTED, None, each=wrong, **data
-        )
+        data = {"code": code, "address": origin.address}
+        await self._audit_log.record_rejection(account or CLOUD, AccountEvent.SIGN_IN_REFUSED, None, each=wrong, **data)
 
-    async def _require_right(self, caller: Identity, row: Row | None, old: str | None, whence: SignInOrigin) -> None:
+    async def _require_right(self, caller: Identity, row: Row | None, old: str | None, origin: SignInOrigin) -> None:
         if old is None:
             session = await self._sessions.get(caller)
             if session is None or not session.fresh_by_link(self._clock.now_ms()):
@@ -155,10 +153,10 @@ class Passwords:
                     "Enter the old password, or use a new one-time link and set the password within 10 minutes."
                 )
             return
-        counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(caller.name): WRONG_TRIES}
+        counters = {**by_address(origin.address, WRONG_TRIES_FROM), named_partition(caller.name): WRONG_TRIES}
         await self._guess_limiter.add_failure(GUESS, counters)
         if not await self._hasher.check(records.read(row, _Stored).hash if row else None, normalize(old)):
-            await self._refused(caller.account, whence, WRONG)
+            await self._refused(caller.account, origin, WRONG)
             raise forbidden("The old password is wrong.")
         await self._guess_limiter.remove_failure(GUESS, counters)
 

@@ -17,14 +17,14 @@ from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.identity.authenticator import Authenticator, principal
 from function_app.services.identity.sessions import Sessions
 
-AT_ONCE = 16
+MAX_CONCURRENT = 16
 """Devices that are processed concurrently."""
 
 _log = logging.getLogger(__name__)
 
 
 class SignOut:
-    """Ends sign-in sessions, and API keys, which have a session of their own."""
+    """Ends sign-in sessions, including the sessions of API keys."""
 
     def __init__(
         self,
@@ -50,10 +50,10 @@ class SignOut:
     async def end(self, caller: Identity) -> None:
         """End the session of ``caller``: first its tokens, then its broker connections, then its leases.
 
-        Without broker or device, credentials expire within 15 minutes and leases in their time; neither can be renewed.
+        If broker or device are not reachable, credentials expire within 15 minutes and leases at their expiry time.
         """
         async with self._audit_log.change(caller.account, AccountEvent.SIGNED_OUT, caller) as change:
-            await change.noted()
+            await change.store_pending()
             await self._authenticator.sign_out(caller)
             await self._sessions.drop(caller.account, caller.session)
         try:
@@ -78,10 +78,12 @@ class SignOut:
         return len(others)
 
     async def _release(self, caller: Identity) -> None:
-        gate = asyncio.Semaphore(AT_ONCE)
-        await asyncio.gather(*(self._let_go(caller, device, gate) for device in await self._devices.all(caller)))
+        gate = asyncio.Semaphore(MAX_CONCURRENT)
+        await asyncio.gather(
+            *(self._release_device(caller, device, gate) for device in await self._devices.all(caller))
+        )
 
-    async def _let_go(self, caller: Identity, device: Device, gate: asyncio.Semaphore) -> None:
+    async def _release_device(self, caller: Identity, device: Device, gate: asyncio.Semaphore) -> None:
         async with gate:
             lease = await read_lease(self._tables, device)
             if lease is None or not lease.held_by(caller) or not lease.is_live(self._clock.now_ms()):

@@ -67,49 +67,49 @@ class ActionAcks:
         if stored is None:
             await self._answer(topic.agent, ack)
         elif ack.status.terminal and Status.PUBLISHED.value in stored.action.times:
-            # Otherwise the request that published the command has not stored that yet, and measures when it does.
+            # Otherwise the publishing request has not stored the publication yet; it measures the latency later.
             await self._latencies.measured(stored.action, by)
         if by != "mqtt":
-            # Last, so that after a failure the agent gets the command again and repeats the ack.
+            # Last: after a failure the agent receives the command again and repeats the ack.
             await self._mailbox.withdraw(topic.agent, ack.id)
 
     async def _answer(self, agent: str, ack: Ack) -> None:
         """Store the ack of a command that is not an action: its sender may wait for it."""
         if ack.status.terminal or ack.status in CONFIRMING:
-            await self._mailbox.store_answer(agent, ack)
+            await self._mailbox.store_ack(agent, ack)
 
     async def follow(
         self,
         stored: StoredAction,
         acks: AsyncIterator[Ack] | None,
         *,
-        wanted: Status,
+        target: Status,
         wait_ms: int,
         published: Publication | None = None,
     ) -> Action:
         """Wait until the action reaches ``wanted`` or ends, at most ``wait_ms``.
 
         Acks are collected and written once before this returns, so later requests read at least this state. ``acks``
-        are those since before the command was published; ``None``: poll the row. ``published``: record the publication
-        too.
+        contains all acks since the command was published; ``None``: poll the row. ``published``: also record the
+        publication.
         """
         end = asyncio.get_running_loop().time() + wait_ms / 1000
         if acks is None:
             if published:
                 stored = await self._write(stored, (), published, stored.action)
-            return await self._poll(stored, wanted, end)
+            return await self._poll(stored, target, end)
         reports: list[AckReport] = []
-        stored, action = await self._receive(stored, acks, wanted, end, reports)
+        stored, action = await self._receive(stored, acks, target, end, reports)
         return (await self._write(stored, reports, published, action)).action
 
     async def _receive(
-        self, stored: StoredAction, acks: AsyncIterator[Ack], wanted: Status, end: float, reports: list[AckReport]
+        self, stored: StoredAction, acks: AsyncIterator[Ack], target: Status, end: float, reports: list[AckReport]
     ) -> tuple[StoredAction, Action]:
         """Collect acks, and read the row at intervals: the ingest may have stored earlier acks."""
         loop = asyncio.get_running_loop()
         action = stored.action
         pause_s = _FIRST_READ_S
-        while not reached(action, wanted) and (left_s := end - loop.time()) > 0:
+        while not reached(action, target) and (left_s := end - loop.time()) > 0:
             try:
                 async with asyncio.timeout(min(pause_s, left_s)):
                     reports.append(report(await anext(acks), self._clock.now_ms()))
@@ -142,10 +142,10 @@ class ActionAcks:
             await self._latencies.measured(written.action, published.transport)
         return written
 
-    async def _poll(self, stored: StoredAction, wanted: Status, end: float) -> Action:
+    async def _poll(self, stored: StoredAction, target: Status, end: float) -> Action:
         loop = asyncio.get_running_loop()
         pause_s = _POLL_S
-        while not reached(stored.action, wanted) and (left_s := end - loop.time()) > 0:
+        while not reached(stored.action, target) and (left_s := end - loop.time()) > 0:
             await asyncio.sleep(min(pause_s, left_s))
             pause_s = min(2 * pause_s, _SLOWEST_POLL_S)
             stored = await self._action_store.get(stored.action.id) or stored

@@ -21,47 +21,47 @@ from function_app.ports.tables import Tables
 from function_app.services.storage import records
 
 
-async def check(tables: Tables, device: Device, asked: Task) -> None:
+async def check(tables: Tables, device: Device, task: Task) -> None:
     """Reject a task that the description excludes. Without a description the device decides.
 
     Raises:
         Problem: ``unable``; the text lists the available names.
     """
-    if isinstance(asked, MoveJoints):
+    if isinstance(task, MoveJoints):
         return  # frequent and supported by nearly every device: skip reading the description
     row = await tables.get(records.DESCRIPTIONS, device.agent, device.name)
     if row is None:
         return
-    described = records.read(row, Description)
-    if not described.actions:
+    description = records.read(row, Description)
+    if not description.actions:
         return
-    kind = str(type(asked).__struct_config__.tag)
-    _among("kind of action", kind, described.actions)
-    for word, name, reached in _named(asked, described):
-        _among(word, name, reached)
+    kind = str(type(task).__struct_config__.tag)
+    _require_available("kind of action", kind, description.actions)
+    for category, name, available in _names(task, description):
+        _require_available(category, name, available)
 
 
-def _named(asked: Task, described: Description) -> Iterable[tuple[str, str, Sequence[str]]]:
+def _names(task: Task, description: Description) -> Iterable[tuple[str, str, Sequence[str]]]:
     """The names in a task: their kind, the name, and the available names."""
-    match asked:
+    match task:
         case Express(name=name):
-            yield "expression", name, described.expressions
+            yield "expression", name, description.expressions
         case MovePose(frame=frame) if frame:
-            yield "frame", frame, described.frames
+            yield "frame", frame, description.frames
         case TakePosture(name=name):
-            yield "posture", name, described.postures
+            yield "posture", name, description.postures
         case RunBehaviour(name=name):
-            yield "behaviour", name, described.behaviours
+            yield "behaviour", name, description.behaviours
         case CollectData(streams=streams) | TakePicture(streams=streams):
             for stream in streams:
-                yield "stream", stream, [each.name for each in described.streams]
+                yield "stream", stream, [each.name for each in description.streams]
         case CaptureRaw(name=name):
-            yield "capture", name, described.captures
+            yield "capture", name, description.captures
         case SetControl(control=control):
-            yield "control", control, [each.name for each in described.controls]
+            yield "control", control, [each.name for each in description.controls]
 
 
-def _among(word: str, name: str, reached: Sequence[str]) -> None:
-    if name not in reached:
-        detail = f"This device has no {word} '{name}'; it has: {', '.join(reached) or 'none'}."
-        raise Problem("unable", 422, "The device cannot do this", detail, extras={"names": list(reached)})
+def _require_available(category: str, name: str, available: Sequence[str]) -> None:
+    if name not in available:
+        detail = f"This device has no {category} '{name}'; it has: {', '.join(available) or 'none'}."
+        raise Problem("unable", 422, "The device cannot do this", detail, extras={"names": list(available)})

@@ -19,7 +19,7 @@ from function_app.services.storage import records
 
 
 class MovementUnavailable(Exception):  # noqa: N818 (an outcome that callers expect)
-    """The pinned script does not exist any more."""
+    """The pinned script was deleted."""
 
 
 class PermissionEnded(Exception):  # noqa: N818 (an outcome that callers expect)
@@ -65,8 +65,8 @@ class ActionDispatcher:
         """The current identity and device of an action, read again because it may have been queued for long.
 
         Raises:
-            PermissionEnded: The device has another owner or is gone, share or key have ended or changed, or the account
-                has signed out.
+            PermissionEnded: The device was removed or has another owner, share or key have ended or changed, or the
+                account has signed out.
         """
         caller = await self._devices.current_identity(Identity(action.account, action.caller, action.session))
         device, _ = (None, None) if caller is None else await self._devices.find_with_link(caller, action.device)

@@ -55,10 +55,10 @@ class Actions:
             return stored.action
         async with self._delivery.acks(device, action) as acks:
             stored = await self._action_store.get(action) or stored
-            return await self._acks.follow(stored, acks, wanted=Status(wait_for), wait_ms=wait_ms)
+            return await self._acks.follow(stored, acks, target=Status(wait_for), wait_ms=wait_ms)
 
     async def cancel(self, caller: Identity, action: str) -> Action:
-        """Request the device to cancel an action. A queued action ends at once; others end when the device reports it.
+        """Request the device to cancel an action. Queued actions end immediately, others when the device reports it.
 
         Raises ``action-unknown``, ``forbidden``, ``broker-unavailable`` or ``busy``.
         """

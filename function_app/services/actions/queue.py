@@ -1,8 +1,8 @@
 """Advances the queue of each device when its slot is free.
 
 The next action starts or ends; it does not wait for a lease. An action with an epoch requires that its lease is still
-held. An action without an epoch gets its own lease, and fails if another session holds one: motion must not start at
-the moment a person releases control.
+held. An action without an epoch gets its own lease, and fails if another session holds one, because motion must not
+start when a person releases control.
 """
 
 import logging
@@ -28,7 +28,7 @@ from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 
-LOOK_MS: Final = 2_000
+CHECK_MS: Final = 2_000
 """Interval of queue checks, in case a process was killed after it freed the slot."""
 REMINDER: Final = "queue"
 """Kind of the reminders to check a queue."""
@@ -62,7 +62,7 @@ class ActionQueues:
     async def change(
         self, action: str, change: Callable[[Action], Action], *, existing: StoredAction | None = None
     ) -> StoredAction | None:
-        """As ``ActionStore.change``; then advance the queue if other actions waited for it. Raises ``busy``."""
+        """Like ``ActionStore.change``; then advance the queue if other actions are queued. Raises ``busy``."""
         stored = await self._action_store.change(action, change, existing=existing)
         if stored is not None and stored.waited_for:
             await self.advance(stored.action.device)
@@ -70,7 +70,7 @@ class ActionQueues:
 
     async def schedule_check(self, device: str) -> None:
         """Schedule a check of a device's queue; call it before the queue is written."""
-        await self._reminders.schedule(f"{REMINDER}:{device}", self._clock.now_ms() + LOOK_MS)
+        await self._reminders.schedule(f"{REMINDER}:{device}", self._clock.now_ms() + CHECK_MS)
 
     async def check(self, device: str) -> bool:
         """Advance a device's queue; return whether it is not empty."""
@@ -87,13 +87,13 @@ class ActionQueues:
 
     async def cancel_all(self, device: str, why: str) -> None:
         """Cancel all queued actions. Raises ``busy``."""
-        await self._lose(device, lambda queue: queue.with_all_cancelled(why))
+        await self._change_queue(device, lambda queue: queue.with_all_cancelled(why))
 
     async def cancel(self, device: str, actions: Collection[str], why: str) -> None:
         """Cancel some of the queued actions. Raises ``busy``."""
-        await self._lose(device, lambda queue: queue.with_cancelled(actions, why))
+        await self._change_queue(device, lambda queue: queue.with_cancelled(actions, why))
 
-    async def _lose(self, device: str, change: Callable[[ActionQueue], ActionQueue]) -> None:
+    async def _change_queue(self, device: str, change: Callable[[ActionQueue], ActionQueue]) -> None:
         async def attempt() -> None:
             control = await read_control_rows(self._tables, device)
             changed = change(control.queue)
@@ -126,7 +126,7 @@ class ActionQueues:
         if stored is None or stored.action.status is not Status.QUEUED:
             await self._tables.batch(records.CONTROL, [control.write_queue(device, queue.without(queue.actions[0]))])
             return True
-        return await self._turn(stored)
+        return await self._start_next(stored)
 
     async def _drop(self, device: str, action: str, status: Status, code: str, message: str) -> None:
         """End a dropped action, which also removes it from the queue."""
@@ -136,7 +136,7 @@ class ActionQueues:
         if control.queue.contains(action):
             await self._tables.batch(records.CONTROL, [control.write_queue(device, control.queue.without(action))])
 
-    async def _turn(self, stored: StoredAction) -> bool:
+    async def _start_next(self, stored: StoredAction) -> bool:
         """Start the first action, or end it if it cannot start."""
         action = stored.action
         now_ms = self._clock.now_ms()
@@ -162,7 +162,7 @@ class ActionQueues:
         try:
             await self._dispatcher.send(started, device)
         except MovementUnavailable:
-            _log.warning("action %s: its script is gone; the timer ends it", action.id)
+            _log.warning("action %s: its script was deleted; the timer ends it", action.id)
         except PermissionEnded as ended:
             _log.warning("action %s: %s; the timer ends it", action.id, ended.why)
         return False

@@ -109,7 +109,7 @@ class StartAction:
         """
         if not isinstance(request.request, Task):
             parameters.check(request.request.parameters)
-        wanted = Status(request.wait_for)
+        target = Status(request.wait_for)
         async with AsyncExitStack() as stack:
             try:
                 async with gate or nullcontext():
@@ -119,8 +119,8 @@ class StartAction:
                         stored, acks, published = await self._begin(caller, device, link, request, key, stack)
             except _Undelivered as undelivered:
                 return undelivered.action, False
-            action = await self._acks.follow(stored, acks, wanted=wanted, wait_ms=request.wait_ms, published=published)
-        return action, reached(action, wanted)
+            action = await self._acks.follow(stored, acks, target=target, wait_ms=request.wait_ms, published=published)
+        return action, reached(action, target)
 
     async def _begin(  # noqa: PLR0917 (the request and its context)
         self,
@@ -132,13 +132,13 @@ class StartAction:
         stack: AsyncExitStack,
     ) -> _Pending:
         require_operator(device)
-        earlier = await self._earlier(device, request, key) if key else None
-        if earlier is not None:
-            return await self._join(earlier, device, stack)
+        existing = await self._existing(device, request, key) if key else None
+        if existing is not None:
+            return await self._join(existing, device, stack)
         now_ms = self._clock.now_ms()
         require_online(link, now_ms)
         action_id = command_id(device.id, now_ms)
-        task, asked, pinned = await self._task(device, request)
+        task, stored_request, pinned = await self._task(device, request)
         # Validated before any write: a command that cannot be sent must not occupy the slot.
         command = self._command_sender.validated(device, action_id, task, caller=caller.name)
         draft = Action(
@@ -147,7 +147,7 @@ class StartAction:
             account=caller.account,
             caller=caller.name,
             pairing=device.pairing,
-            request=asked,
+            request=stored_request,
             epoch=0,
             created_ms=now_ms,
             ttl_ms=min(request.ttl_ms, request.timeout_ms),
@@ -166,7 +166,7 @@ class StartAction:
             await self._queues.advance(device.id)
         if not created or action.status is Status.QUEUED:
             return await self._join(stored, device, stack)
-        await self._require_still(caller, device, stored)
+        await self._require_still_allowed(caller, device, stored)
         signed = await self._command_sender.sign(
             msgspec.structs.replace(command, epoch=action.epoch, issued_at_ms=action.created_ms, ttl_ms=action.ttl_ms)
         )
@@ -179,7 +179,7 @@ class StartAction:
             raise _Undelivered(action) from error
         return stored, acks, published
 
-    async def _require_still(self, caller: Identity, device: Device, stored: StoredAction) -> None:
+    async def _require_still_allowed(self, caller: Identity, device: Device, stored: StoredAction) -> None:
         """End the action if the caller lost access to the device while it was written.
 
         Raises ``device-unknown`` or ``forbidden``.
@@ -196,7 +196,7 @@ class StartAction:
             raise
 
     async def _join(self, stored: StoredAction, device: Device, stack: AsyncExitStack) -> _Pending:
-        """Follow an action without sending it: an earlier request started it, or it is queued."""
+        """Follow an action that an earlier request started, or that is queued."""
         acks = await stack.enter_async_context(self._delivery.acks(device, stored.action.id))
         return await self._action_store.get(stored.action.id) or stored, acks, None
 
@@ -205,12 +205,12 @@ class StartAction:
     ) -> tuple[RunMovement | Task, dict[str, Any], dict[str, Any]]:
         """The task for the device, the request as stored, and the pinned fields of a movement."""
         task = request.request
-        asked: dict[str, Any] = msgspec.to_builtins(task)
+        stored_request: dict[str, Any] = msgspec.to_builtins(task)
         if isinstance(task, Task):
             if isinstance(task, CollectData) and task.duration_s * 1000 > request.timeout_ms:
                 raise invalid("Collecting data takes longer than timeout_ms. Raise timeout_ms, or lower duration_s.")
             await capability_check.check(self._tables, device, task)
-            return task, asked, {}
+            return task, stored_request, {}
         # A device runs the movements of its owner only, also when another account starts them.
         owner = Identity(device.owner, "", "")
         movement, source = await self._movements.get(owner, device.robot_type, task.name)
@@ -227,13 +227,13 @@ class StartAction:
             timeout_ms=request.timeout_ms,
         )
         # Stored with the default values: a republished command must be identical.
-        asked["parameters"] = run.parameters
-        return run, asked, {name: getattr(run, name) for name in PINNED}
+        stored_request["parameters"] = run.parameters
+        return run, stored_request, {name: getattr(run, name) for name in PINNED}
 
     async def _write(
         self, caller: Identity, device: Device, draft: Action, request: ActionRequest
     ) -> tuple[StoredAction, bool]:
-        """Write action, slot, lease and idempotency row in one batch; ``False``: the key's action exists already."""
+        """Write action, slot, lease and idempotency row in one batch; ``False``: the action of the key exists."""
 
         async def attempt() -> tuple[StoredAction, bool]:
             now_ms = self._clock.now_ms()
@@ -241,9 +241,9 @@ class StartAction:
             control = await apply_ended_epoch(self._tables, device, control, caller, now_ms)
             if now_ms - draft.created_ms > ABANDON_MS:
                 raise busy_store()
-            earlier = await self._earlier(device, request, draft.idempotency_key) if draft.idempotency_key else None
-            if earlier is not None:
-                return earlier, False
+            existing = await self._existing(device, request, draft.once) if draft.once else None
+            if existing is not None:
+                return existing, False
             before = control.action or next(iter((*control.queue.actions, *control.queue.dropped)), "")
             lease = _lease(caller, control, draft, request, before, now_ms)
             action = draft if lease is None else replace(draft, epoch=lease.epoch)
@@ -274,7 +274,7 @@ class StartAction:
 
         return await records.retry(attempt)
 
-    async def _earlier(self, device: Device, request: ActionRequest, key: str) -> StoredAction | None:
+    async def _existing(self, device: Device, request: ActionRequest, key: str) -> StoredAction | None:
         """The action that an earlier request with the same idempotency key started."""
         row = await self._tables.get(records.CONTROL, device.id, key)
         if row is None:

@@ -30,7 +30,7 @@ from function_app.services.messaging.delivery import Delivery
 
 REPEAT_S: Final = 0.2
 CONFIRM_MS: Final = 1_000
-AT_ONCE: Final = 16
+MAX_CONCURRENT: Final = 16
 """Devices whose tables are written concurrently. The Stop itself is not limited."""
 
 _log = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ class StopDevices:
         Publishes the plain ``stop`` message until confirmed, and a signed command. Cancels all queued actions.
 
         Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``: both ways failed.
+            Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``: neither message was sent.
         """
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "stop"):
@@ -89,7 +89,7 @@ class StopDevices:
             Problem: ``space-unknown``; ``forbidden``: the caller may not stop any device in this space.
         """
         view = None if space is None else await self._spaces.get(caller, space)
-        gate = asyncio.Semaphore(AT_ONCE)
+        gate = asyncio.Semaphore(MAX_CONCURRENT)
         devices = [
             device
             for device in await self._devices.all(caller)
@@ -97,7 +97,7 @@ class StopDevices:
         ]
         if view is not None and not devices and not view.role.may_operate:
             # An empty result would read as if all devices had been stopped.
-            raise forbidden("You may watch this space, but not stop it. Ask its owner or a person on site.")
+            raise forbidden("You may view this space, but not stop it. Ask its owner or a person on site.")
         return await asyncio.gather(*(self._one(caller, device, reason, gate) for device in devices))
 
     async def reset(self, caller: Identity, device_id: str) -> bool:
@@ -127,7 +127,7 @@ class StopDevices:
     async def _stop(
         self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
     ) -> bool:
-        """Send Stop in both ways; write the tables concurrently, not before."""
+        """Send the plain message and the signed command; write the tables concurrently."""
         plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), caller=caller.name, reason=reason)))
         writing: asyncio.Task[None] | None = None
         try:

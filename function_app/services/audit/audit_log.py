@@ -3,8 +3,8 @@
 A record and the new head are one batch with the head's ETag, so concurrent writers never fork the chain. Writes of one
 process at the same time share a batch.
 
-No acknowledged change is missing. A pending change is stored (``wait:<id>``) before its deciding write, and its record
-deletes this row in the same batch. The timer records changes of killed processes as ``unknown``. Events of
+Every acknowledged change is recorded. A pending change is stored (``wait:<id>``) before its deciding write; the batch
+with its record deletes this row. The timer records changes of killed processes as ``unknown``. Events of
 ``ControlEvents`` arrive at least once and are recorded once by id (``once:<day>:<id>``). Heads are also stored in the
 blob store, to detect truncation.
 """
@@ -35,7 +35,7 @@ from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import DAY_MS, Retention
 from function_app.services.storage.write_batcher import WriteBatcher
 
-LOOK_MS: Final = 15_000
+CHECK_MS: Final = 15_000
 """Delay after which the timer checks a chain for pending changes."""
 ABANDON_MS: Final = 60_000
 """Age at which a pending change counts as interrupted."""
@@ -44,11 +44,11 @@ KEEP_IDS_MS: Final = 30 * DAY_MS
 """Time that ids of recorded events are stored. Retries arrive within seconds, or after an outage of the store."""
 QUIET_MS: Final = 10_000
 """A process records the same rejection of the same person at most once in this time."""
-_AT_ONCE: Final = 30
+_MAX_BATCH: Final = 30
 """Records in one batch: two rows each, and the head."""
 _TRIES: Final = 60
 _PAUSE_S: Final = 0.1
-_KNOWN: Final = 4096
+_CACHE_SIZE: Final = 4096
 REMINDER: Final = "audit"
 """Kind of the reminders to check a chain for pending changes."""
 ANCHOR_REMINDER: Final = "anchor"
@@ -74,7 +74,7 @@ class _Job:
 
 
 class Change:
-    """A change in progress. Its ``data`` may be extended until it ends; ``came_to_nothing`` discards it."""
+    """A change in progress. Its ``data`` may be extended until it ends. ``discarded``: record nothing."""
 
     def __init__(self, chain: "AuditLog", owner: str, fields: Entry) -> None:
         self.data: dict[str, Any] = dict(fields.data)
@@ -82,16 +82,16 @@ class Change:
         self._owner = owner
         self._entry = fields
         self._row: Row | None = None
-        self.came_to_nothing = False
+        self.discarded = False
 
-    async def noted(self) -> None:
+    async def store_pending(self) -> None:
         """Store the pending change before the deciding write, which must not follow a ``StoreError``. Idempotent."""
         if self._row is None:
             self._row = await self._chain.open(self._owner, replace(self._entry, outcome="unknown"))
 
     async def end(self, outcome: Outcome) -> None:
         """Record the outcome, if the change was stored as pending."""
-        if self._row is not None and self.came_to_nothing and outcome == "done":
+        if self._row is not None and self.discarded and outcome == "done":
             await self._chain.drop(self._row)
         elif self._row is not None:
             entry = replace(self._entry, outcome=outcome, data=self.data)
@@ -117,17 +117,17 @@ class AuditLog:
         self._retention = retention
         self._reminders = reminders
         self._clock = clock
-        self._batches = WriteBatcher(self._write, most=_AT_ONCE)
-        self._noted: OrderedDict[tuple[str, str, int], None] = OrderedDict()
+        self._batches = WriteBatcher(self._write, most=_MAX_BATCH)
+        self._scheduled: OrderedDict[tuple[str, str, int], None] = OrderedDict()
         self._refused: OrderedDict[tuple[str, ...], int] = OrderedDict()
 
     @contextlib.asynccontextmanager
     async def change(
         self, owner: str, what: str, caller: Identity | None, *, on: str = "", **data: Any
     ) -> AsyncGenerator[Change]:
-        """Record a change: call ``noted`` in the context before the deciding write, else nothing is recorded.
+        """Record a change: call ``store_pending`` in the context before the deciding write, else nothing is recorded.
 
-        A ``Problem`` after it is recorded as refused; after other exceptions the timer records ``unknown``. ``what`` is
+        A later ``Problem`` is recorded as rejected; after other exceptions the timer records ``unknown``. ``what`` is
         an ``AccountEvent`` or ``Fact``, ``on`` its target; ``data`` must not contain secrets.
         """
         at_ms = self._clock.now_ms()
@@ -163,7 +163,7 @@ class AuditLog:
         try:
             await self.record(owner, what, caller, on=on, outcome="rejected", **data)
         except (StoreError, Problem) as error:
-            _log.warning("audit of a refusal: %s", error)
+            _log.warning("audit of a rejection: %s", error)
 
     async def append(self, owner: str, entry: Entry) -> None:
         """Record ``entry``; under contention the timer writes it."""
@@ -198,7 +198,7 @@ class AuditLog:
         left = [row for row in page.rows if row.data["outcome"] != "unknown" or row.data["at_ms"] <= since_ms]
         await self._batches.add(owner, [_Job(dict(row.data), waiting=row) for row in left])
         if len(left) < len(page.rows) or page.cursor is not None:
-            await self._reminders.schedule(f"{REMINDER}:{owner}", now_ms + LOOK_MS)
+            await self._reminders.schedule(f"{REMINDER}:{owner}", now_ms + CHECK_MS)
 
     async def anchor(self, owner: str) -> None:
         """Store the head in the blob store, which other credentials may protect."""
@@ -212,7 +212,7 @@ class AuditLog:
     async def open(self, owner: str, entry: Entry) -> Row:
         """Store a pending entry for the timer."""
         now_ms = self._clock.now_ms()
-        due_ms = (now_ms // LOOK_MS + 2) * LOOK_MS
+        due_ms = (now_ms // CHECK_MS + 2) * CHECK_MS
         if self._new(REMINDER, owner, due_ms):
             await self._reminders.schedule(f"{REMINDER}:{owner}", due_ms)
         return await self._tables.create(records.AUDIT, Row(owner, f"{_WAIT}{entry.id}", entry.fields()))
@@ -234,14 +234,14 @@ class AuditLog:
     def _new(self, what: str, owner: str, when: int) -> bool:
         """Whether this process has not scheduled a check yet."""
         key = (what, owner, when)
-        created = key not in self._noted
-        self._noted[key] = None
-        _bound(self._noted, key)
+        created = key not in self._scheduled
+        self._scheduled[key] = None
+        _bound(self._scheduled, key)
         return created
 
     async def _write(self, owner: str, jobs: list[_Job]) -> None:
-        await self._note_anchor(owner)
-        jobs = _each_once(jobs)
+        await self._schedule_anchor(owner)
+        jobs = _without_duplicates(jobs)
         for attempt in range(_TRIES):
             if attempt:
                 await asyncio.sleep(random.uniform(0, min(_PAUSE_S, 0.004 * attempt)))  # noqa: S311 (spreads writers)
@@ -253,21 +253,21 @@ class AuditLog:
             try:
                 await self._try(owner, row, head, jobs)
             except Conflict:
-                if not await self._are_there(owner, head.seq + 1, jobs):
+                if not await self._were_written(owner, head.seq + 1, jobs):
                     continue
             return
         raise busy_store()
 
-    async def _are_there(self, owner: str, seq: int, jobs: list[_Job]) -> bool:
-        """Whether a rejected batch was in fact written: its response was lost, and the retry failed."""
+    async def _were_written(self, owner: str, seq: int, jobs: list[_Job]) -> bool:
+        """Whether a rejected batch was written: its response was lost, and the client's retry was rejected."""
         first, last = record_key(seq), record_key(seq + len(jobs))
         page = await self._tables.query(records.AUDIT, owner, first=first, last=last, limit=len(jobs))
-        there = [(row.data.get("id"), row.data.get("outcome")) for row in page.rows]
-        return there == [(job.fields["id"], job.fields["outcome"]) for job in jobs]
+        written = [(row.data.get("id"), row.data.get("outcome")) for row in page.rows]
+        return written == [(job.fields["id"], job.fields["outcome"]) for job in jobs]
 
     async def _open(self, owner: str, jobs: list[_Job]) -> list[_Job]:
         """The jobs that no other process has recorded."""
-        still = []
+        remaining = []
         for job in jobs:
             if job.once and await self._tables.get(records.AUDIT, owner, job.once) is not None:
                 continue
@@ -276,10 +276,10 @@ class AuditLog:
                 if row is None and job.fields["outcome"] == "unknown":
                     continue
                 # The outcome is also recorded if the timer has recorded ``unknown`` before.
-                still.append(replace(job, waiting=row))
+                remaining.append(replace(job, waiting=row))
             else:
-                still.append(job)
-        return still
+                remaining.append(job)
+        return remaining
 
     async def _try(self, owner: str, row: Row | None, head: Head, jobs: list[_Job]) -> None:
         """Append ``jobs`` behind ``head``, which ``row`` contains, all or none."""
@@ -302,7 +302,7 @@ class AuditLog:
         name = signing.key_id(key.public_key())
         return {"seq": head.seq, "hash": head.hash, "at_ms": at_ms, "key": name, "signature": signature}
 
-    async def _note_anchor(self, owner: str) -> None:
+    async def _schedule_anchor(self, owner: str) -> None:
         """Schedule the anchor of the head before the write, and list the chain."""
         due_ms = (self._clock.now_ms() // ANCHOR_MS + 1) * ANCHOR_MS
         if self._new(ANCHOR_REMINDER, owner, due_ms):
@@ -321,13 +321,13 @@ def anchors(owner: str) -> str:
     return f"audit/{owner}/heads.jsonl"
 
 
-def _each_once(jobs: list[_Job]) -> list[_Job]:
+def _without_duplicates(jobs: list[_Job]) -> list[_Job]:
     """The jobs without duplicates; the later job with the same id has more data."""
-    named = {job.once or (job.waiting.key if job.waiting else str(id(job))): job for job in jobs}
-    return list(named.values())
+    unique = {job.once or (job.waiting.key if job.waiting else str(id(job))): job for job in jobs}
+    return list(unique.values())
 
 
 def _bound(existing: OrderedDict[Any, Any], newest: Any) -> None:
     existing.move_to_end(newest)
-    if len(existing) > _KNOWN:
+    if len(existing) > _CACHE_SIZE:
         existing.popitem(last=False)

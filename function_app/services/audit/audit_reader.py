@@ -19,7 +19,7 @@ from function_app.ports.tables import Row, Tables
 from function_app.services.audit.audit_log import anchors, record_key
 from function_app.services.storage import records
 
-LOOKED_AT: Final = 1_000
+MAX_SCANNED: Final = 1_000
 """Records read for one page. With a selective filter a page may be short and still have a cursor."""
 _CURSOR_DIGITS: Final = 12
 _LETTERS: Final = "abcdefghijklmnopqrstuvwxyz234567"
@@ -81,7 +81,7 @@ class AuditReader:
             newest = int(cursor)
         else:
             raise invalid_cursor()
-        oldest = max(FIRST, newest - LOOKED_AT + 1)
+        oldest = max(FIRST, newest - MAX_SCANNED + 1)
         result: list[Mapping[str, Any]] = []
         while newest >= oldest and len(result) < limit:
             first = max(oldest, newest - limit + 1)
@@ -100,10 +100,10 @@ class AuditReader:
 
     async def chains(self) -> list[str]:
         """All chains, including deleted ones whose heads are still in the blob store."""
-        named = {row.key async for row in records.all_rows(self._tables, records.AUDIT, "chains")}
+        names = {row.key async for row in records.all_rows(self._tables, records.AUDIT, "chains")}
         for prefix in ("cloud", *_LETTERS):
-            named |= {name.split("/")[1] for name in await self._noted(f"audit/{prefix}")}
-        return sorted(named)
+            names |= {name.split("/")[1] for name in await self._chain_names(f"audit/{prefix}")}
+        return sorted(names)
 
     async def head(self, chain: str) -> Head | None:
         """The end of a chain; ``None`` if it does not exist."""
@@ -112,20 +112,20 @@ class AuditReader:
 
     async def verify(self, chain: str, *, expected: tuple[Head, ...] = ()) -> VerificationResult:
         """Verify a chain against its anchors in the blob store, and against ``expected``: heads stored elsewhere."""
-        noted = await self._anchors(chain)
-        if isinstance(noted, str):
-            return VerificationResult(chain, rules.genesis(chain), noted)
-        existing = {head.seq: head for head in noted} | {head.seq: head for head in expected}
-        for head in (*noted, *expected):
+        anchored = await self._anchors(chain)
+        if isinstance(anchored, str):
+            return VerificationResult(chain, rules.genesis(chain), anchored)
+        existing = {head.seq: head for head in anchored} | {head.seq: head for head in expected}
+        for head in (*anchored, *expected):
             if existing[head.seq] != head:
-                return VerificationResult(chain, head, f"two different heads were noted for record {head.seq}")
+                return VerificationResult(chain, head, f"two different heads are stored for record {head.seq}")
         end = await self._tables.get(records.AUDIT, chain, "head")
         reached, broken = await self._walk(chain, end, existing)
         if not broken:
             broken = await self._end(chain, end, reached)
         if not broken and (missing := [seq for seq in existing if seq > reached.seq]):
-            broken = f"record {reached.seq + 1}: it and all after it are gone; {max(missing)} were noted elsewhere"
-        return VerificationResult(chain, reached, broken, len(noted))
+            broken = f"record {reached.seq + 1} and all later ones are missing; an anchor names record {max(missing)}"
+        return VerificationResult(chain, reached, broken, len(anchored))
 
     async def _walk(self, chain: str, end: Row | None, existing: Mapping[int, Head]) -> tuple[Head, str]:
         """Verify the chain up to ``end``; return the last valid head and the first error."""
@@ -133,14 +133,14 @@ class AuditReader:
         last = _number(end.data.get("seq")) if end is not None else 0
         span = {"first": record_key(0), "last": record_key(last + 1)}
         async for row in records.all_rows(self._tables, records.AUDIT, chain, **span):
-            wrong = rules.record_error(head, row.data)
-            if not wrong and row.key != record_key(head.seq + 1):
-                wrong = "it stands in another place"
-            if wrong:
-                return head, f"record {head.seq + 1}: {wrong}"
+            error = rules.record_error(head, row.data)
+            if not error and row.key != record_key(head.seq + 1):
+                error = "its row has another key"
+            if error:
+                return head, f"record {head.seq + 1}: {error}"
             head = Head(head.seq + 1, str(row.data["hash"]))
             if existing.get(head.seq, head) != head:
-                return head, f"record {head.seq}: another one was noted elsewhere"
+                return head, f"record {head.seq}: its hash differs from the anchor"
         return head, ""
 
     async def _end(self, chain: str, end: Row | None, reached: Head) -> str:
@@ -150,32 +150,32 @@ class AuditReader:
         )
         now = await self._tables.get(records.AUDIT, chain, "head")
         if end is None:
-            return "the head is gone, its records are there" if after.rows and now is None else ""
+            return "the head is missing, but records exist" if after.rows and now is None else ""
         if now is None:
-            return "the head is gone"
+            return "the head is missing"
         if reached.seq != _number(end.data.get("seq")):
-            return f"record {reached.seq + 1}: it is gone"
+            return f"record {reached.seq + 1}: it is missing"
         if reached.hash != end.data.get("hash"):
             return "the head is not the hash of the newest record"
         if after.rows and now.etag == end.etag:
-            return f"record {reached.seq + 1}: it stands behind the head"
+            return f"record {reached.seq + 1}: it is newer than the head"
         return await self._signature(chain, end, reached)
 
     async def _signature(self, chain: str, end: Row, head: Head) -> str:
         if set(end.data) != {"seq", "hash", "at_ms", "key", "signature"}:
-            return "the head has other fields than it was written with"
+            return "the head has other fields than the original"
         key = (await self._keys.archive()).get(str(end.data["key"]))
         if key is None:
             name = str(end.data["key"])[:40]
-            return f"the head is signed with the key {name!r}, which is none of this cloud's, or has leaked"
+            return f"the head is signed with the unknown or leaked key {name!r}"
         try:
             text = str(end.data["signature"])
             signature = base64.b64decode(text, altchars=b"-_", validate=True)
             if base64.urlsafe_b64encode(signature).decode() != text:
-                return "the head's signature is not as it was written"
+                return "the head's signature is not in canonical form"
             key.verify(signature, rules.signed_bytes(chain, head, end.data["at_ms"]))
         except (InvalidSignature, ValueError, binascii.Error):
-            return "the head's signature is wrong"
+            return "the head's signature is invalid"
         return ""
 
     async def _anchors(self, chain: str) -> tuple[Head, ...] | str:
@@ -188,15 +188,15 @@ class AuditReader:
             except (ValueError, TypeError, KeyError):
                 head = None
             if head is None:
-                return f"line {number} of the heads noted in the blob store ({anchors(chain)}) cannot be read"
+                return f"line {number} of the anchors in the blob store ({anchors(chain)}) cannot be read"
             result.append(head)
         return tuple(result)
 
-    async def _noted(self, prefix: str) -> set[str]:
+    async def _chain_names(self, prefix: str) -> set[str]:
         names = set(await self._blobs.list(prefix, limit=_MOST_NAMES))
         if len(names) == _MOST_NAMES:
             for letter in _LETTERS:
-                names |= await self._noted(prefix + letter)
+                names |= await self._chain_names(prefix + letter)
         return names
 
 

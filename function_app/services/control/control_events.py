@@ -1,8 +1,7 @@
 """Records control events in the device's events and in the owner's audit log, without loss.
 
 A lease change and its events are one batch in the device's partition of ``Control``. From there they are moved to
-``EventLog`` and ``AuditLog``: at once, by the next change, or by the timer. Rejections change no lease and are recorded
-directly.
+``EventLog`` and ``AuditLog``: immediately, by the next change, or by the timer. Rejections are recorded directly.
 """
 
 import contextlib
@@ -26,7 +25,7 @@ from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 from function_app.services.telemetry.event_log import EventLog
 
-LOOK_MS: Final = 15_000
+CHECK_MS: Final = 15_000
 """Delay after which the timer checks a changed lease, in case the process was killed."""
 QUIET_MS: Final = 10_000
 """A process records the same rejection of the same person at most once in this time."""
@@ -35,7 +34,7 @@ REFUSALS: Final = frozenset({"forbidden", "lease-held", "lease-lost", "lease-req
 REMINDER: Final = "lease"
 """Kind of the reminders to check a lease."""
 _EVENT: Final = "event:"
-_KNOWN: Final = 1_000
+_CACHE_SIZE: Final = 1_000
 
 _log = logging.getLogger(__name__)
 
@@ -55,7 +54,7 @@ class ControlEvents:
 
     async def schedule_check(self, device: str) -> None:
         """Schedule a check of a device's lease; call it before the lease is written."""
-        await self._reminders.schedule(f"{REMINDER}:{device}", self._clock.now_ms() + LOOK_MS)
+        await self._reminders.schedule(f"{REMINDER}:{device}", self._clock.now_ms() + CHECK_MS)
 
     async def check(self, device: str) -> None:
         """Called by the timer: publish stored events and timeouts, and schedule the next check. Raises ``busy``."""
@@ -63,12 +62,12 @@ class ControlEvents:
         lease = (await read_control_rows(self._tables, device)).lease
         now_ms = self._clock.now_ms()
         pairing = lease.pairing if lease else ""
-        late = [happened.event(_name(device)) for happened in control_events.timed_out(lease, now_ms)]
-        for event in late:
+        timeouts = [fact.event(_name(device)) for fact in control_events.timed_out(lease, now_ms)]
+        for event in timeouts:
             await self._events.add(device, pairing, event)
-        if late:
+        if timeouts:
             await self._audit_log.append_all(
-                await self._owner(device, pairing), [_entry(device, event, {}) for event in late]
+                await self._owner(device, pairing), [_entry(device, event, {}) for event in timeouts]
             )
         if lease is not None:
             ends = [lease.expires_ms] if lease.is_live(now_ms) else []
@@ -147,7 +146,7 @@ class ControlEvents:
             return
         self._refused.pop(key, None)
         self._refused[key] = now_ms
-        if len(self._refused) > _KNOWN:
+        if len(self._refused) > _CACHE_SIZE:
             del self._refused[next(iter(self._refused))]
         message = f"{caller.name} was refused to {what}: {problem.detail}"
         try:
@@ -161,7 +160,7 @@ class ControlEvents:
                 data={"caller": caller.name, "wanted": what, "code": problem.code},
             )
         except (StoreError, Problem) as error:
-            _log.warning("refusal on %s: %s", device.id, error)
+            _log.warning("rejection on %s: %s", device.id, error)
 
 
 def event_writes(

@@ -77,10 +77,10 @@ class ControlRequests:
         async with self._control_events.recording_rejections(device, caller, "ask for control"):
             require_operator(device)
             _, lease = await self._lease_store.change(caller, device, changed)
-        asked = lease.request
-        assert asked is not None  # noqa: S101 (the rule has just written it)
-        left_ms = max(1, asked.expires_ms - self._clock.now_ms())
-        order = RequestControl(request=asked.id, requester=asked.by, answer_within_ms=left_ms)
+        control_request = lease.request
+        assert control_request is not None  # noqa: S101 (the rule has just written it)
+        left_ms = max(1, control_request.expires_ms - self._clock.now_ms())
+        order = RequestControl(request=control_request.id, requester=control_request.by, answer_within_ms=left_ms)
         try:
             shown = await self._command_sender.send_confirmed(
                 device, order, caller=caller.name, epoch=lease.epoch, wait_ms=wait_ms
@@ -88,7 +88,7 @@ class ControlRequests:
         except Problem as problem:
             _log.warning("request for %s: %s", device.id, problem.detail)
             shown = False
-        return lease, asked, asked.id == created, shown
+        return lease, control_request, control_request.id == created, shown
 
     async def accept(
         self, caller: Identity, device_id: str, request: str, *, wait_ms: int
@@ -105,19 +105,19 @@ class ControlRequests:
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "hand control over"):
             require_operator(device)
-            await self._require_asker(device, request)
+            await self._require_requester(device, request)
             before, lease = await self._change(caller, device, rules.accept, request)
             if before is not lease:
-                await self._require_asker_still(device, lease)
-        _, asked = rules.find(lease, request)
+                await self._require_requester_still_allowed(device, lease)
+        _, control_request = rules.find(lease, request)
         if before is lease or before is None:
             # Accepted by an earlier call. Each renewal announces the lease to the device.
-            return lease, asked, False
+            return lease, control_request, False
         confirmed, _ = await asyncio.gather(
             self._leases.grant(device, lease, by=caller.name, wait_ms=wait_ms),
             self._revocation.cut(device, before.epoch),
         )
-        return lease, asked, confirmed
+        return lease, control_request, confirmed
 
     async def reject(self, caller: Identity, device_id: str, request: str) -> tuple[Lease, ControlRequest]:
         """Reject the request.
@@ -150,22 +150,24 @@ class ControlRequests:
             caller, device, lambda lease, now_ms: rule(lease, caller, request=request, now_ms=now_ms)
         )
 
-    async def _require_asker(self, device: Device, request: str) -> None:
+    async def _require_requester(self, device: Device, request: str) -> None:
         """Check that the requester is signed in and may operate. The rule handles closed requests."""
-        lease, asked = rules.find(await read_lease(self._tables, device), request)
-        if asked.current_outcome(lease, self._clock.now_ms()) != "open":
+        lease, control_request = rules.find(await read_lease(self._tables, device), request)
+        if control_request.current_outcome(lease, self._clock.now_ms()) != "open":
             return
-        asker = await self._devices.current_identity(Identity(asked.account, asked.by, asked.session))
-        result = (await self._devices.find_with_link(asker, device.id))[0] if asker is not None else None
+        requester = await self._devices.current_identity(
+            Identity(control_request.account, control_request.by, control_request.session)
+        )
+        result = (await self._devices.find_with_link(requester, device.id))[0] if requester is not None else None
         if result is None or not result.role.may_operate:
-            raise _asker_gone(asked.by, "You keep control.")
+            raise _requester_offline(control_request.by, "You keep control.")
 
-    async def _require_asker_still(self, device: Device, lease: Lease) -> None:
-        asker = Identity(lease.account, lease.holder, lease.session, key=key_of(lease.session))
+    async def _require_requester_still_allowed(self, device: Device, lease: Lease) -> None:
+        requester = Identity(lease.account, lease.holder, lease.session, key=key_of(lease.session))
         try:
-            await self._leases.require_still_allowed(asker, device)
+            await self._leases.require_still_allowed(requester, device)
         except Problem as problem:
-            raise _asker_gone(lease.holder, "The lease is free now.") from problem
+            raise _requester_offline(lease.holder, "The lease is free now.") from problem
 
     async def _drop(self, caller: Identity, device: Device, lease: Lease, request: str) -> None:
         """Remove the request from the device's state, best effort: it also expires there."""
@@ -173,6 +175,6 @@ class ControlRequests:
         await self._command_sender.try_send(device, order, caller=caller.name, epoch=lease.epoch)
 
 
-def _asker_gone(by: str, then: str) -> Problem:
-    detail = f"{by} has signed out, or may not operate this device any more. {then}"
-    return Problem("requester-offline", 409, "The requester is gone", detail)
+def _requester_offline(by: str, then: str) -> Problem:
+    detail = f"{by} has signed out, or may no longer operate this device. {then}"
+    return Problem("requester-offline", 409, "The requester is not available", detail)

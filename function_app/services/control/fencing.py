@@ -1,4 +1,4 @@
-"""Revokes control: increases the epoch, cuts the setpoint connection and holds the device."""
+"""Revokes control: increases the epoch, closes the setpoint connection and holds the device."""
 
 import asyncio
 import logging
@@ -59,20 +59,20 @@ class ControlRevocation:
             return lease
 
         lease = await records.retry(attempt)
-        return lease is None or await self._tell(device, lease, until_s)
+        return lease is None or await self._notify(device, lease, until_s)
 
     async def retry(self, device: Device, account: str, *, until_s: float) -> bool:
         """Notify broker and device again about the end of an account's lease; return whether it succeeded.
 
-        If another account has control now, the device gets its lease. The former epochs are not known any more, so all
-        connections of the account are cut.
+        If another account has control, the device gets its lease. The former epochs are no longer stored, so all
+        connections of the account are closed.
         """
         control = await read_control_rows(self._tables, device.id)
         lease = control.lease
         if lease is None or lease.pairing != device.pairing:
             return True
         if not lease.account:
-            return await self._tell(device, lease, until_s)
+            return await self._notify(device, lease, until_s)
         try:
             async with asyncio.timeout_at(until_s):
                 await self._access.revoke(principal=everything(account))
@@ -81,7 +81,7 @@ class ControlRevocation:
             return False
         return True
 
-    async def _tell(self, device: Device, lease: Lease, until_s: float | None) -> bool:
+    async def _notify(self, device: Device, lease: Lease, until_s: float | None) -> bool:
         """Cut the setpoint connection of the previous epoch and notify the device, concurrently."""
         try:
             async with asyncio.timeout_at(until_s):

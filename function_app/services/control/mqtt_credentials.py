@@ -69,14 +69,14 @@ class MqttCredentials:
         if any(device.owner != caller.account for device in devices) and _rights(
             await self._devices.all(caller)
         ) != _rights(devices):
-            # A share ended concurrently: its connections were cut before these credentials existed.
-            await self._take_back(issued)
+            # A share ended concurrently: its connections were closed before these credentials existed.
+            await self._revoke(issued)
             raise busy_store()
-        await self._require(issued, self._devices.require_key(caller))
+        await self._revoke_unless(issued, self._devices.require_key(caller))
         return issued
 
     async def _watch(self, caller: Identity, devices: list[Device]) -> IssuedCredentials:
-        watched = _watching(devices, self._access)
+        watched = _view_filters(devices, self._access)
         seen = watched.devices
         now_ms = self._clock.now_ms()
         ends_ms = min([now_ms + WATCH_S * 1000, caller.until_ms, *(device.until_ms for device in seen)])
@@ -94,7 +94,7 @@ class MqttCredentials:
         lifetime_s = max(1, (ends_ms - now_ms) // 1000)
         return await self._issue(grant, lifetime_s, tuple(watched.stops), tuple(dict.fromkeys(subscribe)))
 
-    async def _take_back(self, issued: IssuedCredentials) -> None:
+    async def _revoke(self, issued: IssuedCredentials) -> None:
         try:
             await self._access.revoke(client_id=issued.client_id)
         except BrokerAccessError as error:
@@ -122,15 +122,15 @@ class MqttCredentials:
             expires_at=now_ms // 1000 + lifetime_s,
         )
         issued = await self._issue(grant, lifetime_s, publish, ())
-        await self._require(issued, self._devices.require_still_allowed(caller, device))
+        await self._revoke_unless(issued, self._devices.require_still_allowed(caller, device))
         return issued
 
-    async def _require(self, issued: IssuedCredentials, still: Awaitable[object]) -> None:
+    async def _revoke_unless(self, issued: IssuedCredentials, still: Awaitable[object]) -> None:
         """Revoke credentials whose permission ended while they were issued."""
         try:
             await still
         except Problem:
-            await self._take_back(issued)
+            await self._revoke(issued)
             raise
 
     async def agent(self, agent: Agent) -> IssuedCredentials:
@@ -154,7 +154,7 @@ class MqttCredentials:
 
 
 @dataclass(slots=True)
-class _Watched:
+class _ViewFilters:
     """The filters of one connection, and the devices that they cover.
 
     Attributes:
@@ -169,10 +169,10 @@ class _Watched:
     devices: list[Device] = field(default_factory=list)
     stops: list[str] = field(default_factory=list)
 
-    def add(self, says: list[str], hears: tuple[str, ...], access: BrokerAccess) -> bool:
+    def add(self, stop_filters: list[str], view_filters: tuple[str, ...], access: BrokerAccess) -> bool:
         """Add filters; return whether they fit."""
-        publish = list(dict.fromkeys([*self.publish, *says]))
-        subscribe = list(dict.fromkeys([*self.subscribe, *hears]))
+        publish = list(dict.fromkeys([*self.publish, *stop_filters]))
+        subscribe = list(dict.fromkeys([*self.subscribe, *view_filters]))
         size = sum(len(pattern) + 3 for pattern in (*publish, *subscribe))
         if size > TOPIC_BYTES or not access.accepts(publish, subscribe):
             return False
@@ -180,32 +180,34 @@ class _Watched:
         return True
 
 
-def _watching(devices: list[Device], access: BrokerAccess) -> _Watched:
+def _view_filters(devices: list[Device], access: BrokerAccess) -> _ViewFilters:
     """The filters to view these devices, and the devices that fit.
 
     Whole spaces come first. All filters are part of one CONNECT, whose size brokers limit, so further devices are left
     out. Share the space instead of many single devices.
     """
-    result = _Watched()
-    whole: set[str] = set()
+    result = _ViewFilters()
+    covered: set[str] = set()
     for space, role in sorted({(device.space, device.space_role) for device in devices if device.space_role}):
-        says = [topics.device(space, topics.ANY, topics.ANY, topics.STOP)] if role.may_operate else []
-        if not result.add(says, grants.device_subscriptions(space, topics.ANY, topics.ANY), access):
+        stop_filters = [topics.device(space, topics.ANY, topics.ANY, topics.STOP)] if role.may_operate else []
+        if not result.add(stop_filters, grants.device_subscriptions(space, topics.ANY, topics.ANY), access):
             break
-        inside = [device for device in devices if device.space == space and device.space_role]
-        result.devices += inside
-        whole |= {device.id for device in inside}
-        result.stops += [_stop(device) for device in inside if role.may_operate]
+        members = [device for device in devices if device.space == space and device.space_role]
+        result.devices += members
+        covered |= {device.id for device in members}
+        result.stops += [_stop(device) for device in members if role.may_operate]
     stoppable = set(result.stops)
     for device in devices:
-        says = [_stop(device)] if device.role.may_operate and _stop(device) not in stoppable else []
-        hears = () if device.id in whole else grants.device_subscriptions(device.space, device.agent, device.name)
-        if not says and not hears:
+        stop_filters = [_stop(device)] if device.role.may_operate and _stop(device) not in stoppable else []
+        view_filters = (
+            () if device.id in covered else grants.device_subscriptions(device.space, device.agent, device.name)
+        )
+        if not stop_filters and not view_filters:
             continue
-        if not result.add(says, hears, access):
+        if not result.add(stop_filters, view_filters, access):
             break
-        result.stops += says
-        result.devices += [device] if hears else []
+        result.stops += stop_filters
+        result.devices += [device] if view_filters else []
     return result
 
 

@@ -67,7 +67,7 @@ class DeviceAccess:
         spec = agent.device(parts[1]) if agent else None
         if agent is None or spec is None:
             return None, None
-        allowed = (await self._standings(caller, agent, [spec.name])).get(spec.name)
+        allowed = (await self._permissions(caller, agent, [spec.name])).get(spec.name)
         if allowed is None:
             return None, None
         return _device(agent, spec, allowed), _of(agent, rows, "link", Link)
@@ -112,7 +112,7 @@ class DeviceAccess:
     async def all(self, caller: Identity) -> list[Device]:
         """All visible devices, without their current state."""
         ids = [*await self._all_agent_ids(caller.account), *await self._shared_agent_ids(caller.account)]
-        visible = await asyncio.gather(*(self._seen_of(caller, agent) for agent in ids))
+        visible = await asyncio.gather(*(self._visible_devices(caller, agent) for agent in ids))
         return [device for devices_ in visible for device in devices_]
 
     async def agents(self, caller: Identity, *, cursor: str | None, limit: int) -> tuple[list[Agent], str | None]:
@@ -121,14 +121,14 @@ class DeviceAccess:
         rows = await asyncio.gather(*(self._tables.get(records.AGENTS, agent, "agent") for agent in ids))
         agents = [records.read(row, Agent) for row in rows if row is not None]
         own = [agent for agent in agents if agent.account == caller.account]
-        return [agent for agent in own if not agent.devices or await self._standings(caller, agent)], following
+        return [agent for agent in own if not agent.devices or await self._permissions(caller, agent)], following
 
-    async def _seen_of(self, caller: Identity, agent_id: str) -> list[Device]:
+    async def _visible_devices(self, caller: Identity, agent_id: str) -> list[Device]:
         row = await self._tables.get(records.AGENTS, agent_id, "agent")
         if row is None:
             return []
         agent = records.read(row, Agent)
-        allowed = await self._standings(caller, agent)
+        allowed = await self._permissions(caller, agent)
         return [_device(agent, spec, allowed[spec.name]) for spec in agent.devices if spec.name in allowed]
 
     async def _agent_ids(self, caller: Identity, cursor: str | None, limit: int) -> tuple[list[str], str | None]:
@@ -142,9 +142,9 @@ class DeviceAccess:
             if following is not None:
                 return own, following
         shared = [agent for agent in await self._shared_agent_ids(caller.account) if agent > after]
-        chosen = shared[: limit - len(own)]
-        last = chosen[-1] if chosen else after
-        return own + chosen, f"{_SHARED}{last}" if len(shared) > len(chosen) else None
+        selected = shared[: limit - len(own)]
+        last = selected[-1] if selected else after
+        return own + selected, f"{_SHARED}{last}" if len(shared) > len(selected) else None
 
     async def _own_agent_ids(self, account: str, cursor: str | None, limit: int) -> tuple[list[str], str | None]:
         page = await records.page(
@@ -187,19 +187,22 @@ class DeviceAccess:
             for device in devices_of(agent)
         ]
 
-    async def _standings(
+    async def _permissions(
         self, caller: Identity, agent: Agent, names: Iterable[str] | None = None
     ) -> dict[str, Permissions]:
         """Permissions of ``caller`` on the visible devices of an agent."""
-        wanted = [spec.name for spec in agent.devices] if names is None else list(names)
+        requested = [spec.name for spec in agent.devices] if names is None else list(names)
         shares: list[Share] = []
         if agent.account is not None and agent.account != caller.account:
-            targets = [space_target(agent.space or ""), *(device_target(device_id(agent.id, name)) for name in wanted)]
+            targets = [
+                space_target(agent.space or ""),
+                *(device_target(device_id(agent.id, name)) for name in requested),
+            ]
             key = share_key(caller.account)
             rows = await asyncio.gather(*(self._tables.get(records.SHARES, on, key) for on in targets))
             shares = [records.read(row, Share) for row in rows if row is not None]
         now_ms = self._clock.now_ms()
-        result = {name: access.permissions(caller, agent, name, shares, now_ms) for name in wanted}
+        result = {name: access.permissions(caller, agent, name, shares, now_ms) for name in requested}
         return {name: allowed for name, allowed in result.items() if allowed is not None}
 
     async def _owner_name(self, caller: Identity, agent: Agent) -> str:
@@ -215,27 +218,27 @@ class DeviceAccess:
         if "agent" not in rows:
             return []
         agent = records.read(rows["agent"], Agent)
-        chosen = [spec for spec in agent.devices if only in {None, spec.name}]
-        allowed = await self._standings(caller, agent, [spec.name for spec in chosen])
+        specs = [spec for spec in agent.devices if only in {None, spec.name}]
+        allowed = await self._permissions(caller, agent, [spec.name for spec in specs])
         if not allowed:
             return []
         owner_name = await self._owner_name(caller, agent)
         now_ms = self._clock.now_ms()
         link = _of(agent, rows, "link", Link)
         views = []
-        for spec in chosen:
+        for spec in specs:
             if spec.name not in allowed:
                 continue
             device = _device(agent, spec, allowed[spec.name])
             last = _of(agent, rows, f"state:{spec.name}", LastState)
-            seen_ms = max(link.seen_ms if link else 0, last.seen_ms if last else 0)
+            last_seen_ms = max(link.seen_ms if link else 0, last.seen_ms if last else 0)
             lease = await read_lease(self._tables, device)
             views.append(
                 DeviceView(
                     device=device,
                     owner_name=owner_name,
-                    online=devices.online(link, seen_ms, now_ms),
-                    last_seen_ms=seen_ms or None,
+                    online=devices.online(link, last_seen_ms, now_ms),
+                    last_seen_ms=last_seen_ms or None,
                     state=last.state if last else None,
                     lease=lease if lease and lease.is_live(now_ms) and not _ended(lease, last) else None,
                 )
@@ -285,8 +288,8 @@ def devices_of(agent: Agent) -> list[Device]:
 def departed_devices(agent: Agent, leaving: Departure) -> list[Device]:
     """The devices of a departure, with the permissions of their former owner."""
     before = replace(agent, account=leaving.account, space=leaving.space, pairing=leaving.pairing)
-    gone = DeviceSpec("", "", "", "")
-    return [_device(before, replace(agent.device(name) or gone, name=name)) for name in leaving.devices]
+    unknown = DeviceSpec("", "", "", "")
+    return [_device(before, replace(agent.device(name) or unknown, name=name)) for name in leaving.devices]
 
 
 def _ended(lease: Lease, last: LastState | None) -> bool:

@@ -34,7 +34,7 @@ class DeviceRename:
                 if row is None or agent is None or agent.pairing != device.pairing:
                     raise not_found("device", device.id)
                 changed = rules.rename(agent, device.name, label)
-                await change.noted()
+                await change.store_pending()
                 await self._tables.replace(records.AGENTS, Row(agent.id, "agent", records.to_data(changed), row.etag))
 
             await records.retry(attempt)

@@ -42,7 +42,7 @@ class Spaces:
         result += [
             view for view in await asyncio.gather(*(self._shared(caller, name) for name in ids)) if view is not None
         ]
-        return tuple(view for each in result if (view := _seen(caller, each)) is not None)
+        return tuple(view for each in result if (view := _as_seen_by(caller, each)) is not None)
 
     async def get(self, caller: Identity, space: str) -> SpaceView:
         """One space. Raises ``space-unknown``."""
@@ -53,10 +53,10 @@ class Spaces:
             view = SpaceView(records.read(row, Space), Role.OWNER, owner)
         else:
             view = await self._shared(caller, space)
-        seen = None if view is None else _seen(caller, view)
-        if seen is None:
+        visible = None if view is None else _as_seen_by(caller, view)
+        if visible is None:
             raise not_found("space", space)
-        return seen
+        return visible
 
     async def own(self, caller: Identity, space: str) -> SpaceView:
         """One space of the account itself. Raises ``space-unknown`` or ``forbidden``."""
@@ -81,7 +81,7 @@ class Spaces:
         return records.read(row, Account).name if row else ""
 
 
-def _seen(caller: Identity, view: SpaceView) -> SpaceView | None:
+def _as_seen_by(caller: Identity, view: SpaceView) -> SpaceView | None:
     if caller.only and space_target(view.space.id) not in caller.only:
         return None
     return SpaceView(view.space, access.capped(caller, view.role), view.owner)

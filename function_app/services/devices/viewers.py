@@ -16,13 +16,13 @@ from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.storage import records
 from function_app.services.storage.retention import Retention
 
-GOOD_MS: Final = 25_000
+VALID_MS: Final = 25_000
 """Validity of a report [ms]; pages report every ten seconds."""
-MOST: Final = 50
+MAX_VIEWERS: Final = 50
 """Maximum number of viewers per device; further viewers see the list but are not in it."""
-_AGAIN_MS: Final = 5_000
+_MIN_INTERVAL_MS: Final = 5_000
 """Minimum interval between stored reports of a session [ms]."""
-_FORGOTTEN_MS: Final = 3_600_000
+_DELETE_INTERVAL_MS: Final = 3_600_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Viewers:
         """Report that ``caller`` views a device; return the other viewers, longest first. Raises ``device-unknown``."""
         device = await self._devices.get(caller, device_id)
         now_ms = self._clock.now_ms()
-        page = await self._tables.query(records.WATCHERS, device.id, limit=2 * MOST)
+        page = await self._tables.query(records.WATCHERS, device.id, limit=2 * MAX_VIEWERS)
         rows = {row.key: (row, records.read(row, Viewer)) for row in page.rows}
         live = {
             key: existing
@@ -60,10 +60,10 @@ class Viewers:
             if existing.expires_ms > now_ms and existing.pairing == device.pairing
         }
         mine = live.get(caller.session)
-        if mine is None and len(live) < MOST:
-            await self._tidy([row for key, (row, _) in rows.items() if key not in live])
-        if (len(live) < MOST) if mine is None else now_ms - mine.said_ms >= _AGAIN_MS:
-            await self._note(device, caller, now_ms)
+        if mine is None and len(live) < MAX_VIEWERS:
+            await self._delete_expired([row for key, (row, _) in rows.items() if key not in live])
+        if (len(live) < MAX_VIEWERS) if mine is None else now_ms - mine.said_ms >= _MIN_INTERVAL_MS:
+            await self._store(device, caller, now_ms)
         others = [existing for key, existing in live.items() if key != caller.session]
         return sorted(others, key=lambda existing: existing.since_ms)
 
@@ -72,14 +72,14 @@ class Viewers:
         device = await self._devices.get(caller, device_id)
         await records.remove(self._tables, records.WATCHERS, device.id, caller.session)
 
-    async def _note(self, device: Device, caller: Identity, now_ms: int) -> None:
+    async def _store(self, device: Device, caller: Identity, now_ms: int) -> None:
         # One deletion per hour, scheduled before the row is written.
-        due_ms = (now_ms // _FORGOTTEN_MS + 2) * _FORGOTTEN_MS
+        due_ms = (now_ms // _DELETE_INTERVAL_MS + 2) * _DELETE_INTERVAL_MS
         await self._retention.delete_rows_at(records.WATCHERS, device.id, first="", last=None, due_ms=due_ms)
 
-        def said(existing: Viewer | None) -> Viewer:
-            goes_on = existing is not None and existing.expires_ms > now_ms and existing.pairing == device.pairing
-            since_ms = existing.since_ms if existing is not None and goes_on else now_ms
+        def updated(existing: Viewer | None) -> Viewer:
+            continues = existing is not None and existing.expires_ms > now_ms and existing.pairing == device.pairing
+            since_ms = existing.since_ms if existing is not None and continues else now_ms
             return Viewer(
                 account=caller.account,
                 session=caller.session,
@@ -87,14 +87,14 @@ class Viewers:
                 role=device.role,
                 since_ms=since_ms,
                 said_ms=now_ms,
-                expires_ms=now_ms + GOOD_MS,
+                expires_ms=now_ms + VALID_MS,
                 pairing=device.pairing,
             )
 
-        await records.upsert(self._tables, records.WATCHERS, device.id, caller.session, said, Viewer)
+        await records.upsert(self._tables, records.WATCHERS, device.id, caller.session, updated, Viewer)
 
-    async def _tidy(self, over: list[Row]) -> None:
+    async def _delete_expired(self, expired: list[Row]) -> None:
         """Delete expired rows of a device."""
-        if over:
+        if expired:
             with contextlib.suppress(Conflict):  # deleted by another process
-                await self._tables.batch(records.WATCHERS, [Write("delete", row) for row in over[:MAX_BATCH]])
+                await self._tables.batch(records.WATCHERS, [Write("delete", row) for row in expired[:MAX_BATCH]])

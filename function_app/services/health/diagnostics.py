@@ -30,8 +30,8 @@ MAX_FIELDS = 100
 """Maximum number of monitored fields per stream: first those listed by the robot type, then others by name."""
 RULES_MS = 60_000
 """Interval at which a device's rules are read again."""
-_RULES_KEPT = 1_000
-_AT_ONCE = 20
+_MAX_CACHED_RULES = 1_000
+_MAX_CONCURRENT = 20
 
 Values = Mapping[str, float]
 
@@ -62,7 +62,7 @@ class Summary:
 
 
 @dataclass(frozen=True, slots=True)
-class _Kept:
+class _StreamState:
     """Row content: start of the current window [ms], its sums and counts, and the detector states."""
 
     window_ms: int = 0
@@ -96,28 +96,28 @@ class Diagnostics:
 
         Raises ``busy``.
         """
-        listed = await self._listed(device)
+        declared = await self._declared(device)
         names = {name for _, values in means for name in values}
-        if not _rules(listed, stream, names):
+        if not _rules(declared, stream, names):
             return
-        tried: set[str] = set()
+        reported: set[str] = set()
 
         async def attempt() -> None:
             row = await self._tables.get(records.DIAGNOSTICS, _partition(device), stream)
-            existing = _Kept() if row is None else records.read(row, _Kept)
-            rules = _rules(listed, stream, names | set(existing.sums) | set(existing.watches))
+            existing = _StreamState() if row is None else records.read(row, _StreamState)
+            rules = _rules(declared, stream, names | set(existing.sums) | set(existing.watches))
             after = existing
             for at_ms, values in sorted(means, key=lambda mean: mean[0]):
-                after = _take(after, rules, at_ms, values)
+                after = _add_mean(after, rules, at_ms, values)
             if after is existing:
                 return
             # Faults are updated on changes and every minute, which also repairs the state after a kill.
             before = {name for name, watch in existing.watches.items() if watch.findings}
             now = {name for name, watch in after.watches.items() if watch.findings}
             minute = existing.window_ms // MINUTE_MS != after.window_ms // MINUTE_MS
-            if minute or now != before | tried or _worse(existing, after):
-                await self._faults.settle(device, f"detector/{stream}", _reports(listed, stream, after))
-                tried.update(now)
+            if minute or now != before | reported or _has_new_breach(existing, after):
+                await self._faults.settle(device, f"detector/{stream}", _reports(declared, stream, after))
+                reported.update(now)
             data = records.to_data(after)
             if row is None:
                 await self._tables.create(records.DIAGNOSTICS, Row(_partition(device), stream, data))
@@ -130,12 +130,12 @@ class Diagnostics:
         """Health of a device and of each monitored field. Raises ``device-unknown``."""
         view = await self._devices.view(caller, device_id)
         summary = await self._summary(view)
-        listed = await self._listed(view.device)
+        declared = await self._declared(view.device)
         page = await self._tables.query(records.DIAGNOSTICS, _partition(view.device), limit=1000)
         fields = []
         for row in page.rows:
-            watches = records.read(row, _Kept).watches
-            rules = _rules(listed, row.key, set(watches))
+            watches = records.read(row, _StreamState).watches
+            rules = _rules(declared, row.key, set(watches))
             fields += [
                 FieldView(row.key, name, rules[name], watches[name]) for name in sorted(watches) if name in rules
             ]
@@ -153,15 +153,15 @@ class Diagnostics:
         views, following = await self._devices.views(caller, cursor=cursor, limit=limit)
         chosen = [view for view in views if space in {None, view.device.space}]
         result: list[Summary] = []
-        for first in range(0, len(chosen), _AT_ONCE):
-            result += await asyncio.gather(*(self._summary(view) for view in chosen[first : first + _AT_ONCE]))
+        for first in range(0, len(chosen), _MAX_CONCURRENT):
+            result += await asyncio.gather(*(self._summary(view) for view in chosen[first : first + _MAX_CONCURRENT]))
         return sorted(result, key=lambda summary: (-summary.health.rank, summary.view.device.id)), following
 
     async def _summary(self, view: DeviceView) -> Summary:
         faults = tuple(await self._faults.open(view.device))
         return Summary(view, diagnosis.health(faults, online=view.online), faults)
 
-    async def _listed(self, device: Device) -> tuple[Diagnostic, ...]:
+    async def _declared(self, device: Device) -> tuple[Diagnostic, ...]:
         """The declared measurements of a device: from its description, or from its robot type."""
         now_ms = self._clock.now_ms()
         key = (device.id, device.pairing)
@@ -171,7 +171,7 @@ class Diagnostics:
         row = await self._tables.get(records.DESCRIPTIONS, device.agent, device.name)
         result = () if row is None else records.read(row, Description).diagnostics
         result = result or await self._of_type(device)
-        if len(self._rules) >= _RULES_KEPT:
+        if len(self._rules) >= _MAX_CACHED_RULES:
             self._rules.clear()
         self._rules[key] = (now_ms, result)
         return result
@@ -188,40 +188,40 @@ class Diagnostics:
         return robot_type.diagnostics
 
 
-def _rules(listed: Sequence[Diagnostic], stream: str, names: set[str]) -> dict[str, Rule]:
+def _rules(declared: Sequence[Diagnostic], stream: str, names: set[str]) -> dict[str, Rule]:
     """The rule of each monitored field. Of the joint stream only listed fields are monitored."""
     result: dict[str, Rule] = {}
     for name in sorted(names):
-        given = next((one for one in listed if one.stream == stream and fnmatch.fnmatchcase(name, one.fields)), None)
-        if given is not None:
+        entry = next((one for one in declared if one.stream == stream and fnmatch.fnmatchcase(name, one.fields)), None)
+        if entry is not None:
             limits = Limits(
-                low=given.low,
-                high=given.high,
-                warning_low=given.warning_low,
-                warning_high=given.warning_high,
-                change=given.change,
-                horizon_s=given.horizon_s,
-                kinds=given.checks,
+                low=entry.low,
+                high=entry.high,
+                warning_low=entry.warning_low,
+                warning_high=entry.warning_high,
+                change=entry.change,
+                horizon_s=entry.horizon_s,
+                kinds=entry.checks,
             )
-            result[name] = Rule(given.label, given.unit, given.advice, limits, listed=True)
+            result[name] = Rule(entry.label, entry.unit, entry.advice, limits, listed=True)
         elif stream != topics.JOINTS:
             result[name] = Rule(name.partition(".")[0])
     chosen = sorted(result, key=lambda name: (not result[name].listed, name))[:MAX_FIELDS]
     return {name: result[name] for name in chosen}
 
 
-def _take(kept: _Kept, rules: Mapping[str, Rule], at_ms: int, values: Values) -> _Kept:
+def _add_mean(state: _StreamState, rules: Mapping[str, Rule], at_ms: int, values: Values) -> _StreamState:
     """Add one mean; a mean of a later window closes the current window."""
     window_ms = at_ms // WINDOW_MS * WINDOW_MS
-    if window_ms < kept.window_ms:
-        return kept
-    sums, watches = kept.sums, kept.watches
-    if window_ms > kept.window_ms:
+    if window_ms < state.window_ms:
+        return state
+    sums, watches = state.sums, state.watches
+    if window_ms > state.window_ms:
         watches = dict(watches)
         for name, (total, count) in sums.items():
             if name in rules:
                 watch = watches.get(name, DetectorState())
-                watches[name] = detectors.update(watch, rules[name].limits, kept.window_ms, total / count)
+                watches[name] = detectors.update(watch, rules[name].limits, state.window_ms, total / count)
         watches = {name: watch for name, watch in watches.items() if name in rules}
         sums = {}
     sums = dict(sums)
@@ -229,10 +229,10 @@ def _take(kept: _Kept, rules: Mapping[str, Rule], at_ms: int, values: Values) ->
         if name in values:
             total, count = sums.get(name, (0.0, 0))
             sums[name] = (total + values[name], count + 1)
-    return _Kept(window_ms, sums, watches)
+    return _StreamState(window_ms, sums, watches)
 
 
-def _worse(existing: _Kept, after: _Kept) -> bool:
+def _has_new_breach(existing: _StreamState, after: _StreamState) -> bool:
     """Whether a field has newly exceeded a limit."""
     return any(
         watch.breach.on and not (name in existing.watches and existing.watches[name].breach.on)
@@ -240,9 +240,9 @@ def _worse(existing: _Kept, after: _Kept) -> bool:
     )
 
 
-def _reports(listed: Sequence[Diagnostic], stream: str, kept: _Kept) -> list[Report]:
-    rules = _rules(listed, stream, set(kept.watches))
-    reports = [diagnosis.diagnose(rule, stream, name, kept.watches[name]) for name, rule in rules.items()]
+def _reports(declared: Sequence[Diagnostic], stream: str, state: _StreamState) -> list[Report]:
+    rules = _rules(declared, stream, set(state.watches))
+    reports = [diagnosis.diagnose(rule, stream, name, state.watches[name]) for name, rule in rules.items()]
     return [report for report in reports if report is not None]
 
 

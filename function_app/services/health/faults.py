@@ -42,22 +42,22 @@ class Faults:
 
         ``reports`` are all current faults of one reporter, the ``scope``. Raises ``busy``.
         """
-        wanted = {_key(scope, report.code): report for report in list(reports)[:MAX_OPEN]}
+        current = {_key(scope, report.code): report for report in list(reports)[:MAX_OPEN]}
 
         async def attempt() -> bool:
             rows = await self._read(device)
             existing = {row.key: row for row in rows if row.key.startswith(f"{_OPEN}{scope}:")}
-            news = any(row.key.startswith(_EVENT) for row in rows)
+            changed = any(row.key.startswith(_EVENT) for row in rows)
             for key, row in existing.items():
-                if key not in wanted:
+                if key not in current:
                     await self._clear(device, row)
-                    news = True
-            for key, report in wanted.items():
-                news |= await self._report(device, key, report, existing.get(key))
-            return news
+                    changed = True
+            for key, report in current.items():
+                changed |= await self._report(device, key, report, existing.get(key))
+            return changed
 
         if await records.retry(attempt):
-            await self._tell(device)
+            await self._publish_events(device)
 
     async def open(self, device: Device) -> list[Fault]:
         """Open faults, worst first, then newest first."""
@@ -84,7 +84,9 @@ class Faults:
             if row is None:
                 if await self._tables.get(records.FAULTS, _partition(device), f"{_PAST}{fault[:64]}") is None:
                     raise not_found("fault", fault)
-                raise Problem("fault-cleared", 409, "The fault is over", "It was cleared; there is nothing left to do.")
+                raise Problem(
+                    "fault-cleared", 409, "The fault is cleared", "It was cleared and needs no acknowledgement."
+                )
             existing = records.read(row, Fault)
             seen = rules.acknowledged(existing, by=by, now_ms=self._clock.now_ms())
             if seen is not existing:
@@ -93,7 +95,7 @@ class Faults:
             return seen
 
         result = await records.retry(attempt)
-        await self._tell(device)
+        await self._publish_events(device)
         return result
 
     async def _read(self, device: Device) -> list[Row]:
@@ -106,11 +108,11 @@ class Faults:
         partition = _partition(device)
         if row is not None:
             existing = records.read(row, Fault)
-            worse = rules.reported(existing, report)
-            if worse is not existing:
-                write = Write("replace", Row(partition, key, records.to_data(worse), row.etag))
-                await self._write(device, worse, f"worsened-{worse.worse}", [write])
-            return worse is not existing
+            worsened = rules.reported(existing, report)
+            if worsened is not existing:
+                write = Write("replace", Row(partition, key, records.to_data(worsened), row.etag))
+                await self._write(device, worsened, f"worsened-{worsened.worse}", [write])
+            return worsened is not existing
         now_ms = self._clock.now_ms()
         count_key = _COUNT + key.removeprefix(_OPEN)
         counted = await self._tables.get(records.FAULTS, partition, count_key)
@@ -138,7 +140,7 @@ class Faults:
         event = Row(_partition(device), f"{_EVENT}{fault.id}:{step}", _event(device, fault, step, self._clock.now_ms()))
         await self._tables.batch(records.FAULTS, [*writes, Write("create", event)])
 
-    async def _tell(self, device: Device) -> None:
+    async def _publish_events(self, device: Device) -> None:
         page = await self._tables.query(records.FAULTS, _partition(device), first=_EVENT, last="event;", limit=1000)
         for row in page.rows:
             await self._events.add(device.id, device.pairing, row.data)

@@ -20,7 +20,7 @@ from function_app.services.health.faults import Faults
 from function_app.services.storage import records
 
 SHARDS = 4
-_LOOKED_AT = 100
+_MAX_CHECKED = 100
 _DEVICE, _CLOUD = "device", "cloud"
 
 
@@ -37,7 +37,7 @@ class ReportedFaults:
         row = await self._tables.get(records.AGENTS, agent.id, "link")
         if row is not None and records.read(row, Link).session >= session:
             return
-        await self._watch(agent.id, self._clock.now_ms())
+        await self._schedule_check(agent.id, self._clock.now_ms())
         for device in devices_of(agent):
             await self._faults.settle(device, _CLOUD, [])
 
@@ -46,10 +46,10 @@ class ReportedFaults:
         device = next(result for result in devices_of(agent) if result.name == name)
         _, existing = await records.find(self._tables, records.AGENTS, agent.id, f"state:{name}", LastState)
         if existing is not None and msgspec.convert(existing.state, State, strict=False) == state:
-            return  # redelivered: not a sign of life
+            return  # redelivered: the device is not necessarily active
         now_ms = self._clock.now_ms()
         if existing is None or now_ms - existing.seen_ms > SILENT_MS:
-            await self._watch(agent.id, now_ms)
+            await self._schedule_check(agent.id, now_ms)
             await self._faults.settle(device, _CLOUD, [])
         if existing is None or state.faults or existing.state.get("faults"):
             await self._faults.settle(device, _DEVICE, [_reported(fault.code, fault.message) for fault in state.faults])
@@ -59,37 +59,37 @@ class ReportedFaults:
         await asyncio.gather(*(self._shard(str(shard), now_ms) for shard in range(SHARDS)))
 
     async def _shard(self, shard: str, now_ms: int) -> None:
-        page = await self._tables.query(records.WATCHED, shard, last=f"{now_ms + 1:013d}", limit=_LOOKED_AT)
+        page = await self._tables.query(records.WATCHED, shard, last=f"{now_ms + 1:013d}", limit=_MAX_CHECKED)
         for note in page.rows:
             agent = note.key.partition(":")[2]
             newest = await self._tables.get(records.WATCHED, shard, f"agent:{agent}")
             if newest is None or newest.data["note"] <= note.key:
-                await self._look(agent, now_ms)
+                await self._check_agent(agent, now_ms)
             try:
                 await self._tables.delete(records.WATCHED, note)
             except Conflict:
                 continue
 
-    async def _look(self, agent_id: str, now_ms: int) -> None:
-        """The silent devices of an online agent, and the time of the next check."""
+    async def _check_agent(self, agent_id: str, now_ms: int) -> None:
+        """Update the faults for silent devices of an online agent, and schedule the next check."""
         page = await self._tables.query(records.AGENTS, agent_id, limit=1000)
         rows = {row.key: row for row in page.rows}
         agent = records.read(rows["agent"], Agent) if "agent" in rows else None
         link = records.read(rows["link"], Link) if "link" in rows else None
         if agent is None or not agent.claimed or link is None or not link.online:
             return
-        heard = []
+        last_seen = []
         for device in devices_of(agent):
             state = rows.get(f"state:{device.name}")
             seen_ms = max(link.seen_ms, records.read(state, LastState).seen_ms if state else 0)
             silent = now_ms - seen_ms > SILENT_MS
             await self._faults.settle(device, _CLOUD, [_silent(device)] if silent else [])
             if not silent:
-                heard.append(seen_ms)
-        if heard:
-            await self._watch(agent_id, min(heard))
+                last_seen.append(seen_ms)
+        if last_seen:
+            await self._schedule_check(agent_id, min(last_seen))
 
-    async def _watch(self, agent: str, seen_ms: int) -> None:
+    async def _schedule_check(self, agent: str, seen_ms: int) -> None:
         """Schedule a check of an agent: write the reminder, then mark it as the newest."""
         shard = str(hashlib.sha256(agent.encode()).digest()[0] % SHARDS)
         key = f"{seen_ms + SILENT_MS + 1:013d}:{agent}"
@@ -107,8 +107,8 @@ class ReportedFaults:
 
 
 def _reported(code: str, message: str) -> Report:
-    said = message or f"The device reports '{code}'. Check the device."
-    return Report(code=code, source=Source.DEVICE, kind="reported", severity=Severity.ERROR, message=said)
+    text = message or f"The device reports '{code}'. Check the device."
+    return Report(code=code, source=Source.DEVICE, kind="reported", severity=Severity.ERROR, message=text)
 
 
 def _silent(device: Device) -> Report:

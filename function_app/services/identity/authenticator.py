@@ -33,7 +33,7 @@ SESSION_S = 12 * 3600
 AGENT_TOKEN_S = 60
 CLOCK_SKEW_S = 30
 """Tolerated clock difference of an agent [s]."""
-KNOWN_TOKENS = 4096
+MAX_CACHED_TOKENS = 4096
 RECHECK_MS = 5_000
 """Interval at which a cached token is checked for sign-out again [ms]."""
 
@@ -41,7 +41,7 @@ Audience = Literal["telescope/api", "telescope/session", "telescope/xmpp"]
 
 
 @dataclass(slots=True)
-class _Known:
+class _CachedToken:
     identity: Identity
     expires_ms: int
     checked_ms: int
@@ -56,7 +56,7 @@ class Authenticator:
         self._retention = retention
         self._keys = keys
         self._clock = clock
-        self._known: OrderedDict[tuple[str, str], _Known] = OrderedDict()
+        self._cache: OrderedDict[tuple[str, str], _CachedToken] = OrderedDict()
 
     async def issue(self, caller: Identity, audience: Audience, lifetime_s: int, *, csrf: str | None = None) -> str:
         """Issue a token for a sign-in session, which it does not outlive. ``csrf`` belongs to a cookie."""
@@ -83,31 +83,33 @@ class Authenticator:
 
     async def page(self, cookie: str) -> tuple[Identity, str]:
         """The identity behind a page's cookie, and its CSRF token. Raises ``unauthorized``."""
-        existing = await self._find(cookie, SESSION)
-        return existing.identity, existing.csrf
+        cached = await self._find(cookie, SESSION)
+        return cached.identity, cached.csrf
 
-    async def _find(self, token: str, audience: Audience) -> _Known:
+    async def _find(self, token: str, audience: Audience) -> _CachedToken:
         now_ms = self._clock.now_ms()
-        existing = self._known.get((audience, token))
-        if existing is None or not self._fresh(existing, now_ms):
+        cached = self._cache.get((audience, token))
+        if cached is None or not self._is_current(cached, now_ms):
             # Verify completely, not only the sign-out: the signing key may have leaked.
-            existing = await self._verify(token, audience)
-            self._remember((audience, token), existing)
-        if now_ms >= existing.expires_ms:
-            self._known.pop((audience, token), None)
+            cached = await self._verify(token, audience)
+            self._cache_token((audience, token), cached)
+        if now_ms >= cached.expires_ms:
+            self._cache.pop((audience, token), None)
             raise unauthorized("The access token has expired. Sign in again.")
-        return existing
+        return cached
 
-    def _remember(self, name: tuple[str, str], existing: _Known) -> None:
+    def _cache_token(self, name: tuple[str, str], cached: _CachedToken) -> None:
         """Cache a verified token, unless it expires before the next check."""
-        self._known[name] = existing
-        self._known.move_to_end(name)
-        while len(self._known) > KNOWN_TOKENS or not self._fresh(next(iter(self._known.values())), existing.checked_ms):
-            self._known.popitem(last=False)
+        self._cache[name] = cached
+        self._cache.move_to_end(name)
+        while len(self._cache) > MAX_CACHED_TOKENS or not self._is_current(
+            next(iter(self._cache.values())), cached.checked_ms
+        ):
+            self._cache.popitem(last=False)
 
     @staticmethod
-    def _fresh(existing: _Known, now_ms: int) -> bool:
-        return 0 <= now_ms - existing.checked_ms < RECHECK_MS
+    def _is_current(cached: _CachedToken, now_ms: int) -> bool:
+        return 0 <= now_ms - cached.checked_ms < RECHECK_MS
 
     async def sign_out(self, caller: Identity) -> None:
         """End the session: other instances reject its tokens within ``RECHECK_MS``."""
@@ -119,8 +121,8 @@ class Authenticator:
         except Conflict:
             return
         finally:
-            for name in [name for name, existing in self._known.items() if existing.identity.session == caller.session]:
-                del self._known[name]
+            for name in [name for name, cached in self._cache.items() if cached.identity.session == caller.session]:
+                del self._cache[name]
 
     async def enrolling(self, token: str, public_key: str) -> str:
         """The id of the agent with this ``public_key``, which must have signed ``token``. Raises ``unauthorized``."""
@@ -145,7 +147,7 @@ class Authenticator:
         self._check_agent(token, signing.public_key(record.public_key))
         return record
 
-    async def _verify(self, token: str, audience: Audience) -> _Known:
+    async def _verify(self, token: str, audience: Audience) -> _CachedToken:
         try:
             kid = jwt.get_unverified_header(token).get("kid", "")
             key = (await self._keys.public(str(kid))).get(str(kid))
@@ -162,7 +164,7 @@ class Authenticator:
         except (jwt.PyJWTError, KeyError) as error:
             raise unauthorized(f"The access token is not valid: {error}. Sign in again.") from error
         await self._check_signed_out(identity)
-        return _Known(identity, int(claims["exp"]) * 1000, self._clock.now_ms(), str(claims.get("csrf", "")))
+        return _CachedToken(identity, int(claims["exp"]) * 1000, self._clock.now_ms(), str(claims.get("csrf", "")))
 
     async def _check_signed_out(self, caller: Identity) -> None:
         if await self._tables.get(records.ACCOUNTS, caller.account, signed_out_key(caller.session)) is not None:

@@ -76,18 +76,18 @@ class Sessions:
         self._audit_log = audit_log
         self._clock = clock
 
-    async def begin(self, account: Account, how: How, whence: SignInOrigin) -> SignedIn:
+    async def begin(self, account: Account, how: How, origin: SignInOrigin) -> SignedIn:
         """Create a session for an authenticated account."""
         now_ms = self._clock.now_ms()
         ends_ms = now_ms + SESSION_S * 1000
-        session = Session(new_session(), how, now_ms, ends_ms, address=whence.address, program=whence.program[:_SHOWN])
+        session = Session(new_session(), how, now_ms, ends_ms, address=origin.address, program=origin.program[:_SHOWN])
         row = Row(account.id, _ROW + session.id, records.to_data(session))
         await self._retention.delete_row_at(records.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
         caller = Identity(account.id, account.name, session.id, until_ms=ends_ms)
         async with self._audit_log.change(
-            account.id, AccountEvent.SIGNED_IN, caller, how=how, address=whence.address
+            account.id, AccountEvent.SIGNED_IN, caller, how=how, address=origin.address
         ) as change:
-            await change.noted()
+            await change.store_pending()
             await self._tables.create(records.ACCOUNTS, row)
         csrf = new_secret()
         return SignedIn(

@@ -34,9 +34,9 @@ class SignIn:
         row = await self._named(name)
         return await self._account(row.partition if row else named_partition(name), name, keep=True)
 
-    async def account_elsewhere(self, issuer: str, subject: str, name: str) -> Account:
+    async def oidc_account(self, issuer: str, subject: str, name: str) -> Account:
         """The account of a person at an OIDC provider, identified by issuer and subject: names may be reassigned."""
-        account = await self._account(_elsewhere(issuer, subject), name, keep=False)
+        account = await self._account(_oidc_partition(issuer, subject), name, keep=False)
         await records.upsert(
             self._tables,
             records.ACCOUNTS,
@@ -47,9 +47,9 @@ class SignIn:
         )
         return account
 
-    async def is_known_elsewhere(self, issuer: str, subject: str) -> bool:
-        """Whether a person at a provider has an account here."""
-        return await self._tables.get(records.ACCOUNTS, _elsewhere(issuer, subject), "account") is not None
+    async def has_oidc_account(self, issuer: str, subject: str) -> bool:
+        """Whether an account exists for a person at an OIDC provider."""
+        return await self._tables.get(records.ACCOUNTS, _oidc_partition(issuer, subject), "account") is not None
 
     async def _account(self, partition: str, name: str, *, keep: bool) -> Account:
         """Create or complete an account; ``keep`` its display name. The next call completes an interrupted creation."""
@@ -83,7 +83,7 @@ class SignIn:
         async with self._audit_log.change(
             caller.account, AccountEvent.SPACE_MADE, caller, on=space.id, name=name
         ) as change:
-            await change.noted()
+            await change.store_pending()
             await self._tables.create(
                 records.ACCOUNTS, Row(caller.account, f"space:{space.id}", records.to_data(space))
             )
@@ -107,17 +107,17 @@ class SignIn:
         await self._tables.create(records.SIGN_INS, Row(hashed[0], hashed, data))
         return token
 
-    async def redeem(self, token: str, whence: SignInOrigin | None = None) -> SignedIn:
+    async def redeem(self, token: str, origin: SignInOrigin | None = None) -> SignedIn:
         """Sign in with a one-time token. Of concurrent requests one succeeds: the one that deletes the row.
 
         Raises:
             Problem: ``unauthorized``: unknown, used or expired; the response is the same.
         """
         hashed = _hash(token)
-        refused = unauthorized("This sign-in link is unknown, used or expired. Ask for a new one.")
+        refused = unauthorized("This sign-in link is unknown, used or expired. Request a new one.")
         row = await self._tables.get(records.SIGN_INS, hashed[0], hashed)
         if row is None:
-            address = whence.address if whence else ""
+            address = origin.address if origin else ""
             await self._audit_log.record_rejection(
                 CLOUD, AccountEvent.SIGN_IN_REJECTED, None, code="link-unknown", address=address
             )
@@ -129,7 +129,7 @@ class SignIn:
         if self._clock.now_ms() >= row.data["expires_ms"]:
             raise refused
         account = Account(id=row.data["account"], name=row.data["name"])
-        return await self._sessions.begin(account, "link", whence or SignInOrigin())
+        return await self._sessions.begin(account, "link", origin or SignInOrigin())
 
     async def _named(self, name: str) -> Row | None:
         """Older rows are stored under their exact spelling, which is looked up first."""
@@ -161,7 +161,7 @@ def _of(row: Row, name: str) -> Account:
     return Account(id=str(row.data["account"]), name=str(row.data.get("name", name)))
 
 
-def _elsewhere(issuer: str, subject: str) -> str:
+def _oidc_partition(issuer: str, subject: str) -> str:
     digest = hashlib.sha256(f"{issuer}\n{subject}".encode()).hexdigest()
     return f"open-id:{digest}"
 

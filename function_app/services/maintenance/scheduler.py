@@ -105,42 +105,42 @@ class Scheduler:
         for shard in range(SHARDS):
             for action, note in await self._reminders.due(shard, self._clock.now_ms()):
                 try:
-                    await self._look(action, note)
+                    await self._check(action, note)
                 except (Problem, BusUnavailable) as error:
                     _log.warning("action %s: %s", action, error)
-        await self._forget_expired()
+        await self._delete_expired()
         await self._retention.delete_due(self._clock.now_ms())
         try:
             await self._reported_faults.check_silent(self._clock.now_ms())
         except Problem as problem:
             _log.warning("silent devices: %s", problem.detail)
         await self._telemetry_ingest.distribute_backlog()
-        await self._uploads.forget_due()
+        await self._uploads.delete_due()
         await self._robot_types.run_due_jobs()
         try:
             await self._access.expire(self._clock.now_ms() / 1000)
         except BrokerAccessError as error:
             _log.warning("broker access: %s", error)
 
-    async def _look(self, what: str, note: Row) -> None:
+    async def _check(self, what: str, note: Row) -> None:
         kind, _, target = what.partition(":")
         if kind == queue.REMINDER:
-            await self._look_at_queue(target, note)
+            await self._check_queue(target, note)
         elif agent := offboarding_of(what):
-            await self._look_at_leaver(agent, note)
+            await self._check_departure(agent, note)
         elif about_share(what):
-            await self._sharing.look(what, note)
+            await self._sharing.check_reminder(what, note)
         elif kind == api_keys_.REMINDER:
-            await self._api_keys.look(target, note)
+            await self._api_keys.check_expiry(target, note)
         elif about_transfer(what):
-            await self._invitations.go_on(what, note)
+            await self._invitations.resume_transfer(what, note)
         elif kind in self._checks:
             await self._checks[kind](target)
             await self._reminders.cancel(note)
         else:
-            await self._look_at_action(what, note)
+            await self._check_action(what, note)
 
-    async def _look_at_action(self, action_id: str, note: Row) -> None:
+    async def _check_action(self, action_id: str, note: Row) -> None:
         result = await self._action_store.get(action_id)
         now_ms = self._clock.now_ms()
         if result is None:
@@ -152,12 +152,11 @@ class Scheduler:
         if verdict in _ENDING:
             after = await self._ended(result, verdict, now_ms)
             if after is not None and after.status.terminal:
-                await self._keep_for_a_while(after)
+                await self._schedule_deletion(after)
             elif after is not None:  # an ack arrived concurrently
                 await self._reminders.schedule(action_id, next_check_ms(after, now_ms))
         else:
-            # Schedule the next check before this reminder is deleted: a kill in between leaves one too many, not too
-            # few.
+            # Schedule the next check before this reminder is deleted, so that a kill in between loses no reminder.
             await self._reminders.schedule(action_id, next_check_ms(result.action, now_ms))
             if verdict is NextStep.PUBLISH:
                 await self._publish(result, now_ms)
@@ -166,7 +165,7 @@ class Scheduler:
         await self._reminders.cancel(note)
 
     async def _ended(self, result: StoredAction, verdict: NextStep, now_ms: int) -> Action | None:
-        """The action after it ended, already or now; unchanged if another step is due."""
+        """End the action if it has not ended; unchanged if another step is due."""
         if verdict is NextStep.ENDED:
             return result.action
         if verdict is NextStep.LOSE:
@@ -181,7 +180,7 @@ class Scheduler:
         message = "The device did not receive the command in time. Check that it is online, then start it again."
         return await self._end(result, Status.EXPIRED, "no-answer", message, now_ms)
 
-    async def _look_at_queue(self, device: str, note: Row) -> None:
+    async def _check_queue(self, device: str, note: Row) -> None:
         """Advance a queue after its process may have been killed."""
         if await self._queues.check(device):
             await self._queues.schedule_check(device)
@@ -189,7 +188,7 @@ class Scheduler:
             return  # an action may be added concurrently
         await self._reminders.cancel(note)
 
-    async def _look_at_leaver(self, agent: str, note: Row) -> None:
+    async def _check_departure(self, agent: str, note: Row) -> None:
         """Continue a departure whose process was killed or could not reach the broker."""
         if not await self._offboarding.finish(agent):
             await self._offboarding.watch(agent)
@@ -207,15 +206,15 @@ class Scheduler:
         after = await self._queues.change(result.action.id, ended, existing=result)
         return None if after is None else after.action
 
-    async def _keep_for_a_while(self, action: Action) -> None:
+    async def _schedule_deletion(self, action: Action) -> None:
         """Schedule the deletion of an ended action and of its idempotency key."""
-        where = row_location(action.id)
-        if where is None:
+        location = row_location(action.id)
+        if location is None:
             return
-        await self._retention.delete_row_at(records.CONTROL, *where, due_ms=action.ended_ms + self._keep_actions_ms)
-        if action.idempotency_key:
+        await self._retention.delete_row_at(records.CONTROL, *location, due_ms=action.ended_ms + self._keep_actions_ms)
+        if action.once:
             await self._retention.delete_row_at(
-                records.CONTROL, where[0], action.idempotency_key, due_ms=action.created_ms + KEEP_ONCE_MS
+                records.CONTROL, location[0], action.once, due_ms=action.created_ms + KEEP_ONCE_MS
             )
 
     async def _publish(self, result: StoredAction, now_ms: int) -> None:
@@ -240,7 +239,7 @@ class Scheduler:
             order = CancelAction(action=action.id)
             await self._command_sender.try_send(device, order, caller=action.caller, epoch=action.epoch)
 
-    async def _forget_expired(self) -> None:
+    async def _delete_expired(self) -> None:
         """Delete expired claim codes and sign-in links, a limited number per run."""
         self._turn += 1
         now_ms = self._clock.now_ms()

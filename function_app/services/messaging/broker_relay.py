@@ -9,9 +9,9 @@ from device_agent.protocol.topics import Topic
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable, CommandBus
 
-GIVE_UP_S = 2.0
+TIMEOUT_S = 2.0
 """Time limit, so that an unreachable broker does not delay an agent's request."""
-REST_MS = 5_000
+PAUSE_MS = 5_000
 """Pause after a failure."""
 _RETAINED = frozenset({topics.CONN, topics.DESC, topics.STATE})
 
@@ -24,25 +24,25 @@ class BrokerRelay:
     def __init__(self, *, bus: CommandBus, clock: Clock) -> None:
         self._bus = bus
         self._clock = clock
-        self._rests_until_ms = 0
+        self._paused_until_ms = 0
 
-    async def publish(self, told: Iterable[tuple[str, Topic, bytes]]) -> None:
+    async def publish(self, messages: Iterable[tuple[str, Topic, bytes]]) -> None:
         """Publish messages in order per topic, retained where the wire contract requires it."""
-        if self._clock.now_ms() < self._rests_until_ms:
+        if self._clock.now_ms() < self._paused_until_ms:
             return
         by_topic: dict[str, list[tuple[Topic, bytes]]] = {}
-        for topic, parsed, payload in told:
+        for topic, parsed, payload in messages:
             by_topic.setdefault(topic, []).append((parsed, payload))
         try:
-            async with asyncio.timeout(GIVE_UP_S), asyncio.TaskGroup() as group:
-                for topic, messages in by_topic.items():
-                    group.create_task(self._publish(topic, messages))
+            async with asyncio.timeout(TIMEOUT_S), asyncio.TaskGroup() as group:
+                for topic, topic_messages in by_topic.items():
+                    group.create_task(self._publish(topic, topic_messages))
         except* (BusUnavailable, TimeoutError) as errors:
-            self._rests_until_ms = self._clock.now_ms() + REST_MS
+            self._paused_until_ms = self._clock.now_ms() + PAUSE_MS
             _log.warning("relayed messages are not published: %s", errors.exceptions[0])
 
-    async def _publish(self, topic: str, messages: Iterable[tuple[Topic, bytes]]) -> None:
-        for parsed, payload in messages:
+    async def _publish(self, topic: str, topic_messages: Iterable[tuple[Topic, bytes]]) -> None:
+        for parsed, payload in topic_messages:
             retain = parsed.kind in _RETAINED
             if retain and len(payload) > codec.MAX_RETAINED_BYTES:
                 _log.warning("%s is too long for a retained message", topic)

@@ -18,7 +18,7 @@ from function_app.services.messaging.delivery import Delivery, SignedCommand
 
 SHORT_TTL_MS = 5_000
 """Time to live of lease and Stop commands. A later arrival must have no effect."""
-STOP_KEPT_MS = 60_000
+STOP_LIFETIME_MS = 60_000
 """A polling agent can fetch a Stop for this long: a late Stop is still valid."""
 _ENVELOPE_BYTES = 512
 """Upper bound of what signature, key, epoch and times add to a validated command."""
@@ -60,7 +60,7 @@ class CommandSender:
         except ProtocolError as error:
             raise invalid(f"{error}.") from error
         stop = isinstance(command.request, StopDevice)
-        expires_ms = command.issued_at_ms + (STOP_KEPT_MS if stop else command.ttl_ms)
+        expires_ms = command.issued_at_ms + (STOP_LIFETIME_MS if stop else command.ttl_ms)
         return SignedCommand(command.id, payload, expires_ms, first=stop)
 
     async def send_action(self, device: Device, request: Request, action: Action) -> None:

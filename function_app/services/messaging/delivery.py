@@ -60,7 +60,7 @@ class Delivery:
             first=signed.first,
         )
         if device.transport == "xmpp":
-            await self._pass_on(topic, signed.payload)
+            await self._relay_message(topic, signed.payload)
 
     async def stop(self, device: Device, payload: bytes) -> None:
         """Publish the plain Stop message. A polling agent gets only the signed command, which stays until acknowledged.
@@ -71,7 +71,7 @@ class Delivery:
         if device.transport == "mqtt":
             await self._bus.publish(f"{device.topic}/{topics.STOP}", payload)
         elif device.transport == "xmpp":
-            await self._pass_on(f"{device.topic}/{topics.STOP}", payload)
+            await self._relay_message(f"{device.topic}/{topics.STOP}", payload)
 
     async def withdraw(self, device: Device, command: str) -> None:
         """Remove a command that the agent has not fetched. Published commands are not affected."""
@@ -95,49 +95,49 @@ class Delivery:
         """
         async with self.acks(device, signed.command) as acks:
             if wait_ms and (acks is None or device.transport != "mqtt"):
-                await self._mailbox.expect_answer(device, signed.command, expires_ms=signed.expires_ms)
+                await self._mailbox.expect_ack(device, signed.command, expires_ms=signed.expires_ms)
             await self.send(device, signed)
             try:
                 async with asyncio.timeout(wait_ms / 1000):
-                    return await self._answer(device, signed.command, acks) in CONFIRMING
+                    return await self._first_ack(device, signed.command, acks) in CONFIRMING
             except TimeoutError:
                 return False
 
-    async def _answer(self, device: Device, command: str, acks: AsyncIterator[Ack] | None) -> AckStatus:
+    async def _first_ack(self, device: Device, command: str, acks: AsyncIterator[Ack] | None) -> AckStatus:
         """The first decisive ack, from the broker or the tables."""
         if acks is None:
-            return await self._noted(device, command)
+            return await self._stored_ack(device, command)
         if device.transport == "mqtt":
-            return await _heard(acks)
-        ways = [asyncio.ensure_future(_heard(acks)), asyncio.ensure_future(self._noted(device, command))]
+            return await _decisive(acks)
+        sources = [asyncio.ensure_future(_decisive(acks)), asyncio.ensure_future(self._stored_ack(device, command))]
         try:
-            done, _ = await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait(sources, return_when=asyncio.FIRST_COMPLETED)
             return done.pop().result()
         finally:
-            for way in ways:
-                way.cancel()
-            await asyncio.gather(*ways, return_exceptions=True)
+            for source in sources:
+                source.cancel()
+            await asyncio.gather(*sources, return_exceptions=True)
 
-    async def _pass_on(self, topic: str, payload: bytes) -> None:
+    async def _relay_message(self, topic: str, payload: bytes) -> None:
         await self._relay.publish([(topic, topics.parse(topic), payload)])
 
-    async def _noted(self, device: Device, command: str) -> AckStatus:
+    async def _stored_ack(self, device: Device, command: str) -> AckStatus:
         """The ack, when it is stored in the tables."""
         pause_s = _POLL_S
-        with self._mailbox.listen(device.agent) as bell:
+        with self._mailbox.changes(device.agent) as changed:
             while True:
-                bell.clear()
-                status = await self._mailbox.stored_answer(device.agent, command)
+                changed.clear()
+                status = await self._mailbox.stored_ack(device.agent, command)
                 if status is not None:
                     return status
                 # Not `wait_for`: it loses the caller's timeout if the event is set at that moment.
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(pause_s):
-                        await bell.wait()
+                        await changed.wait()
                 pause_s = min(2 * pause_s, _SLOWEST_POLL_S)
 
 
-async def _heard(acks: AsyncIterator[Ack]) -> AckStatus:
+async def _decisive(acks: AsyncIterator[Ack]) -> AckStatus:
     while True:
         status = (await anext(acks)).status
         if status in CONFIRMING or status.terminal:

@@ -10,7 +10,7 @@ from function_app.ports.signing_keys import SigningKeys
 from function_app.services.devices.device_access import devices_of
 from function_app.services.messaging.command_sender import CommandSender
 
-_WHO = "telescope"
+_CALLER = "telescope"
 _log = logging.getLogger(__name__)
 
 
@@ -21,7 +21,7 @@ class KeyAnnouncer:
         self._keys = keys
         self._command_sender = command_sender
         self._serial = 0
-        self._told: set[str] = set()
+        self._announced: set[str] = set()
 
     async def on_state(self, agent: Agent, device: str) -> None:
         """Announce a new key to the agent of a device that has sent its state; once per process.
@@ -29,21 +29,21 @@ class KeyAnnouncer:
         Raises:
             StoreError: The keys cannot be read.
         """
-        news = await self._keys.announcement()
-        learning = news.signing != news.pins[-1].id
-        if not learning or not news.statements:
+        announcement = await self._keys.announcement()
+        is_overlap = announcement.signing != announcement.pins[-1].id
+        if not is_overlap or not announcement.statements:
             return
-        if news.serial != self._serial:
-            self._serial = news.serial
-            self._told.clear()
-        if agent.id in self._told:
+        if announcement.serial != self._serial:
+            self._serial = announcement.serial
+            self._announced.clear()
+        if agent.id in self._announced:
             return
-        result = next((each for each in devices_of(agent) if each.name == device), None)
-        if result is None:
+        target = next((each for each in devices_of(agent) if each.name == device), None)
+        if target is None:
             return
         try:
-            await self._command_sender.send(result, RotateKey(statements=news.statements), caller=_WHO, epoch=0)
+            await self._command_sender.send(target, RotateKey(statements=announcement.statements), caller=_CALLER, epoch=0)
         except (BusUnavailable, Problem) as error:
             _log.warning("the new key was not announced to agent %s: %s", agent.id, error)
             return
-        self._told.add(agent.id)
+        self._announced.add(agent.id)

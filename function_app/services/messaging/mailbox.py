@@ -18,10 +18,10 @@ from function_app.services.storage import records
 from function_app.services.storage.retention import Retention
 
 PAGE = 100
-ANSWER_BYTES = 1_000_000
+RESPONSE_BYTES = 1_000_000
 """Maximum size of a response [bytes], unless it has a single payload."""
 _FIRST, _OTHERS, _BEHIND = "0", "1", "2"
-_TIDY_MS = 3_600_000
+_DELETE_INTERVAL_MS = 3_600_000
 """Deletions are scheduled at most once per hour and agent."""
 
 
@@ -37,7 +37,7 @@ class MailboxEntry:
 
 
 @dataclass(frozen=True, slots=True)
-class Awaited:
+class AwaitedAck:
     """The first decisive ack of a command whose sender waits."""
 
     expires_ms: int
@@ -51,8 +51,8 @@ class Mailbox:
         self._tables = tables
         self._retention = retention
         self._clock = clock
-        self._noted: dict[str, int] = {}
-        self._bells: dict[str, set[asyncio.Event]] = {}
+        self._scheduled: dict[str, int] = {}
+        self._waiting: dict[str, set[asyncio.Event]] = {}
 
     async def put(
         self, device: Device, command: str, *, topic: str, payload: bytes, expires_ms: int, first: bool
@@ -61,13 +61,13 @@ class Mailbox:
 
         ``first``: returned before all others, as a Stop.
         """
-        letter = MailboxEntry(command, topic, payload, expires_ms, device.pairing)
-        await self._tidy_later(device.agent, expires_ms)
+        entry = MailboxEntry(command, topic, payload, expires_ms, device.pairing)
+        await self._schedule_deletion(device.agent, expires_ms)
         with contextlib.suppress(Conflict):
             await self._tables.create(
-                records.MAILBOX, Row(device.agent, _key(command, first=first), records.to_data(letter))
+                records.MAILBOX, Row(device.agent, _key(command, first=first), records.to_data(entry))
             )
-        self._ring(device.agent)
+        self._notify(device.agent)
 
     async def pending(self, agent: Agent, *, limit: int, have: Collection[str] = ()) -> list[MailboxEntry]:
         """Unacknowledged commands of this pairing, Stop first, then oldest first; without the ids in ``have``."""
@@ -79,13 +79,13 @@ class Mailbox:
                 records.MAILBOX, agent.id, first=_FIRST, last=_BEHIND, limit=PAGE, cursor=cursor
             )
             for row in page.rows:
-                letter = records.read(row, MailboxEntry)
-                if letter.pairing != agent.pairing or letter.expires_ms <= now_ms or letter.command in have:
+                entry = records.read(row, MailboxEntry)
+                if entry.pairing != agent.pairing or entry.expires_ms <= now_ms or entry.command in have:
                     continue
-                size += len(letter.payload)
-                if result and size > ANSWER_BYTES:
+                size += len(entry.payload)
+                if result and size > RESPONSE_BYTES:
                     return result
-                result.append(letter)
+                result.append(entry)
                 if len(result) == limit:
                     return result
             cursor = page.cursor
@@ -100,14 +100,14 @@ class Mailbox:
                 await records.discard(self._tables, records.MAILBOX, row)
                 return
 
-    async def expect_answer(self, device: Device, command: str, *, expires_ms: int) -> None:
+    async def expect_ack(self, device: Device, command: str, *, expires_ms: int) -> None:
         """Create the row for the ack of a command, before the command is sent. Acks without this row are not stored."""
-        await self._tidy_later(device.agent, expires_ms)
-        place = Row(device.agent, _answer_key(command), records.to_data(Awaited(expires_ms)))
+        await self._schedule_deletion(device.agent, expires_ms)
+        awaited_row = Row(device.agent, _ack_key(command), records.to_data(AwaitedAck(expires_ms)))
         with contextlib.suppress(Conflict):
-            await self._tables.create(records.MAILBOX, place)
+            await self._tables.create(records.MAILBOX, awaited_row)
 
-    async def store_answer(self, agent: str, ack: Ack) -> None:
+    async def store_ack(self, agent: str, ack: Ack) -> None:
         """Store an ack, if its row exists and has no later ack.
 
         Raises:
@@ -115,47 +115,47 @@ class Mailbox:
         """
 
         async def attempt() -> None:
-            row = await self._tables.get(records.MAILBOX, agent, _answer_key(ack.id))
+            row = await self._tables.get(records.MAILBOX, agent, _ack_key(ack.id))
             if row is None:
                 return
-            awaited = records.read(row, Awaited)
+            awaited = records.read(row, AwaitedAck)
             if awaited.status is None or (ack.status.terminal and not awaited.status.terminal):
                 data = records.to_data(replace(awaited, status=ack.status))
                 await self._tables.replace(records.MAILBOX, replace(row, data=data))
 
         await records.retry(attempt)
-        self._ring(agent)
+        self._notify(agent)
 
-    async def stored_answer(self, agent: str, command: str) -> AckStatus | None:
+    async def stored_ack(self, agent: str, command: str) -> AckStatus | None:
         """The stored ack of a command."""
-        row = await self._tables.get(records.MAILBOX, agent, _answer_key(command))
-        return None if row is None else records.read(row, Awaited).status
+        row = await self._tables.get(records.MAILBOX, agent, _ack_key(command))
+        return None if row is None else records.read(row, AwaitedAck).status
 
     @contextlib.contextmanager
-    def listen(self, agent: str) -> Iterator[asyncio.Event]:
+    def changes(self, agent: str) -> Iterator[asyncio.Event]:
         """An event that is set when this process changes the agent's mailbox."""
-        bell = asyncio.Event()
-        bells = self._bells.setdefault(agent, set())
-        bells.add(bell)
+        changed = asyncio.Event()
+        waiting = self._waiting.setdefault(agent, set())
+        waiting.add(changed)
         try:
-            yield bell
+            yield changed
         finally:
-            bells.discard(bell)
-            if not bells:
-                self._bells.pop(agent, None)
+            waiting.discard(changed)
+            if not waiting:
+                self._waiting.pop(agent, None)
 
-    def _ring(self, agent: str) -> None:
-        for bell in self._bells.get(agent, ()):
-            bell.set()
+    def _notify(self, agent: str) -> None:
+        for changed in self._waiting.get(agent, ()):
+            changed.set()
 
-    async def _tidy_later(self, agent: str, expires_ms: int) -> None:
-        due_ms = -(-expires_ms // _TIDY_MS) * _TIDY_MS
-        if self._noted.get(agent, 0) >= due_ms:
+    async def _schedule_deletion(self, agent: str, expires_ms: int) -> None:
+        due_ms = -(-expires_ms // _DELETE_INTERVAL_MS) * _DELETE_INTERVAL_MS
+        if self._scheduled.get(agent, 0) >= due_ms:
             return
         await self._retention.delete_rows_at(records.MAILBOX, agent, first="", last=None, due_ms=due_ms)
-        if len(self._noted) > PAGE * PAGE:
-            self._noted.clear()
-        self._noted[agent] = due_ms
+        if len(self._scheduled) > PAGE * PAGE:
+            self._scheduled.clear()
+        self._scheduled[agent] = due_ms
 
 
 def _key(command: str, *, first: bool) -> str:
@@ -164,5 +164,5 @@ def _key(command: str, *, first: bool) -> str:
     return f"{_FIRST if first else _OTHERS}:{order}:{command}"
 
 
-def _answer_key(command: str) -> str:
+def _ack_key(command: str) -> str:
     return f"ack:{command}"

@@ -11,8 +11,8 @@ from function_app.services.devices.device_access import require_claimed
 from function_app.services.messaging.mailbox import Mailbox, MailboxEntry
 from function_app.services.storage import records
 
-_LOOK_S = 0.05
-_SLOWEST_LOOK_S = 0.25
+_POLL_S = 0.05
+_SLOWEST_POLL_S = 0.25
 """Commands stored by another instance are only found by reading."""
 
 
@@ -34,18 +34,18 @@ class CommandPolling:
         await self.mark_online(agent)
         loop = asyncio.get_running_loop()
         end = loop.time() + wait_ms / 1000
-        pause_s = _LOOK_S
-        with self._mailbox.listen(agent.id) as bell:
+        pause_s = _POLL_S
+        with self._mailbox.changes(agent.id) as changed:
             while True:
-                bell.clear()
+                changed.clear()
                 result = await self._mailbox.pending(agent, limit=limit, have=have)
                 left_s = end - loop.time()
                 if result or left_s <= 0:
                     return result
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(min(pause_s, left_s)):
-                        await bell.wait()
-                pause_s = min(2 * pause_s, _SLOWEST_LOOK_S)
+                        await changed.wait()
+                pause_s = min(2 * pause_s, _SLOWEST_POLL_S)
 
     async def mark_online(self, agent: Agent) -> None:
         """Mark the agent as online, written at intervals. MQTT agents report their connection themselves.

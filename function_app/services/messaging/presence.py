@@ -69,11 +69,11 @@ class PresenceIngest:
                 self._tables, records.AGENTS, topic.agent, "link", lambda existing: newer_link(existing, link), Link
             )
         elif topic.kind == topics.STATE:
-            said = codec.decode(payload, State)
-            await self._reported_faults.on_state(agent, topic.device, said)
-            state = LastState(msgspec.to_builtins(said), now_ms, agent.pairing)
+            state = codec.decode(payload, State)
+            await self._reported_faults.on_state(agent, topic.device, state)
+            last_state = LastState(msgspec.to_builtins(state), now_ms, agent.pairing)
             await records.upsert(
-                self._tables, records.AGENTS, topic.agent, f"state:{topic.device}", lambda _: state, LastState
+                self._tables, records.AGENTS, topic.agent, f"state:{topic.device}", lambda _: last_state, LastState
             )
             await self._key_announcer.on_state(agent, topic.device)
         elif topic.kind == topics.DESC and not topic.name:

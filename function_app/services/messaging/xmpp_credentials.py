@@ -157,7 +157,7 @@ class XmppCredentials:
     def _require(self) -> None:
         if not self._domain:
             detail = "No XMPP server is configured. Use another transport, or set TELESCOPE_XMPP_DOMAIN."
-            raise Problem("xmpp-unavailable", 409, "No XMPP here", detail)
+            raise Problem("xmpp-unavailable", 409, "No XMPP server", detail)
 
     async def _signed(self, user: str, subject: str, lifetime_s: int, **more: str) -> Password:
         key = await self._keys.current()

@@ -22,8 +22,8 @@ class AgentCertificates:
         """
         space = require_claimed(agent)
         if not self._certificates.required:
-            detail = "This broker does not use certificates of agents."
-            raise Problem("certificates-unused", 409, "No certificates here", detail)
+            detail = "This broker does not use agent certificates."
+            raise Problem("certificates-unused", 409, "Certificates are not used", detail)
         try:
             await self._certificates.set_space(agent.id, space)
             return await self._certificates.issue(agent.id, request)

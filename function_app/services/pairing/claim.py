@@ -54,13 +54,13 @@ class Claim:
             Problem: ``claim-code-unknown``: wrong, used or expired; ``too-many-tries``; ``space-unknown``.
         """
         spaces = await self._sign_in.spaces(caller.account)
-        chosen = next((existing.id for existing in spaces if space in (None, existing.id)), None)
-        if chosen is None:
+        target_space = next((existing.id for existing in spaces if space in (None, existing.id)), None)
+        if target_space is None:
             raise not_found("space", space or "")
         counters = {caller.account: WRONG_TRIES, **by_address(address, WRONG_TRIES)}
         try:
             await self._guess_limiter.add_failure(GUESS, counters)
-            agent = await self._redeem(caller, parse_claim_code(text), chosen)
+            agent = await self._redeem(caller, parse_claim_code(text), target_space)
         except Problem as problem:
             await self._refused(caller, problem, address)
             raise
@@ -89,7 +89,7 @@ class Claim:
         ) as change:
             claimed = await records.retry(lambda: self._take(caller, code, agent, space, change))
             if claimed is None:
-                change.came_to_nothing = True
+                change.discarded = True
         if claimed is not None:
             await records.discard(self._tables, records.CLAIMS, result)
         return claimed
@@ -103,7 +103,7 @@ class Claim:
         if agent.claimed or agent.claim_code != code or now_ms >= agent.claim_expires_ms:
             return None
         await self._offboarding.settle(agent)
-        await change.noted()
+        await change.store_pending()
         claimed = devices.claim(agent, account=caller.account, space=space, pairing=new_id(), now_ms=now_ms)
         # Written first: without the agent's row the index entry has no effect.
         member = _Member(claimed.pairing)

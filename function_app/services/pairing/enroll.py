@@ -15,7 +15,7 @@ from function_app.services.storage.retention import DAY_MS, Retention
 CLAIM_MS = 300_000
 KEEP_UNCLAIMED_MS = 7 * DAY_MS
 """An unclaimed agent requests a new code every few minutes; without a request for this time it is deleted."""
-_LOOK_S = 0.2
+_POLL_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +38,10 @@ class Enroll:
         self._retention = retention
         self._clock = clock
 
-    async def enroll(self, agent: str, told: Enrollment) -> Agent:
+    async def enroll(self, agent: str, enrollment: Enrollment) -> Agent:
         """Create or update the agent's row, with a new claim code while it is unclaimed.
 
-        Actions of removed devices end. The code's row is written first: without the agent's row it has no effect.
+        Actions of removed devices end. The row of the code is written first; it has no effect without the agent's row.
 
         Raises:
             Problem: ``agent-id-taken``: another key has the same id (one in 2⁵⁰).
@@ -51,25 +51,29 @@ class Enroll:
             row = await self._tables.get(records.AGENTS, agent, "agent")
             now_ms = self._clock.now_ms()
             if row is None:
-                record = Agent(agent, told.name, told.public_key, told.software, told.devices, now_ms)
+                record = Agent(
+                    agent, enrollment.name, enrollment.public_key, enrollment.software, enrollment.devices, now_ms
+                )
             else:
                 record = records.read(row, Agent)
-                if record.public_key != told.public_key:
+                if record.public_key != enrollment.public_key:
                     detail = "Another agent's key has the same id. Create a new key."
                     raise Problem("agent-id-taken", 409, "The id is taken", detail)
                 before = record.leaving
-                record = replace(with_devices(record, told.devices), name=told.name, software=told.software)
+                record = replace(
+                    with_devices(record, enrollment.devices), name=enrollment.name, software=enrollment.software
+                )
                 if record.leaving != before:
                     await self._offboarding.watch(agent)
-            record = replace(record, transport=told.transport)
+            record = replace(record, transport=enrollment.transport)
             if not record.claimed:
                 expires_ms = now_ms + CLAIM_MS
                 code = await self._new_code(agent, expires_ms)
-                forget_ms = now_ms + KEEP_UNCLAIMED_MS
+                delete_ms = now_ms + KEEP_UNCLAIMED_MS
                 await self._retention.delete_row_at(
-                    records.AGENTS, agent, "agent", due_ms=(forget_ms // DAY_MS + 1) * DAY_MS
+                    records.AGENTS, agent, "agent", due_ms=(delete_ms // DAY_MS + 1) * DAY_MS
                 )
-                record = replace(record, claim_code=code, claim_expires_ms=expires_ms, expires_ms=forget_ms)
+                record = replace(record, claim_code=code, claim_expires_ms=expires_ms, expires_ms=delete_ms)
             new = Row(agent, "agent", records.to_data(record), row.etag if row else "")
             await self._tables.batch(records.AGENTS, [Write("replace" if row else "create", new)])
             return record
@@ -87,7 +91,7 @@ class Enroll:
             left_s = end - loop.time()
             if left_s <= 0:
                 break
-            await asyncio.sleep(min(_LOOK_S, left_s))
+            await asyncio.sleep(min(_POLL_S, left_s))
             row = await self._tables.get(records.AGENTS, agent.id, "agent")
             if row is None:
                 break

@@ -33,7 +33,7 @@ from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import Retention
 from function_app.services.telemetry.series_writer import MARGIN_MS, SeriesWriter
 
-LOOK_MS: Final = 5_000
+CHECK_MS: Final = 5_000
 """Interval of retries while the broker is not reachable."""
 _NOTE: Final = "leave:"
 _RETAINED: Final = ((topics.STATE, ""), (topics.DESC, ""), (topics.DESC, topics.TWIN))
@@ -75,7 +75,7 @@ class Offboarding:
 
     async def watch(self, agent: str) -> None:
         """Schedule the cleanup of an agent, before the deciding write."""
-        await self._reminders.schedule(f"{_NOTE}{agent}", self._clock.now_ms() + LOOK_MS)
+        await self._reminders.schedule(f"{_NOTE}{agent}", self._clock.now_ms() + CHECK_MS)
 
     async def finish(self, agent_id: str) -> bool:
         """Clean up all departures of an agent; return whether the cleanup is complete.
@@ -90,13 +90,13 @@ class Offboarding:
         for leaving in agent.leaving:
             await self._settle(agent, leaving)
             try:
-                await self._tell_broker(agent_id, leaving)
+                await self._clean_broker(agent_id, leaving)
             except (BusUnavailable, BrokerAccessError) as error:
                 _log.warning("%s of %s: %s", leaving.why, agent_id, error)
             else:
                 done.add(leaving)
         if done:
-            await self._strike(agent_id, done)
+            await self._remove_departures(agent_id, done)
         return len(done) == len(agent.leaving)
 
     async def settle(self, agent: Agent) -> None:
@@ -118,7 +118,7 @@ class Offboarding:
             await self._delete(records.AGENTS, agent.id, f"state:{device.name}", leaving)
             if leaving.why == "unpaired":
                 await self._series.forget(device.id, device.pairing)
-                await self._forget_measures(device)
+                await self._delete_measurements(device)
             if leaving.why != "moved":
                 await self._delete(records.DESCRIPTIONS, agent.id, device.name, leaving)
         if leaving.why != "removed":
@@ -126,7 +126,7 @@ class Offboarding:
         if leaving.why == "unpaired":
             await self._delete(records.MEMBERS, leaving.account, f"agent:{agent.id}", leaving)
 
-    async def _forget_measures(self, device: Device) -> None:
+    async def _delete_measurements(self, device: Device) -> None:
         """Delete measurements, events and faults, after all processes have stopped writing to the former pairing."""
         due_ms = self._clock.now_ms() + MARGIN_MS
         for table in (records.EVENTS, records.FAULTS, records.DIAGNOSTICS, records.LATENCY):
@@ -150,24 +150,24 @@ class Offboarding:
         if row is not None and row.data.get("pairing", "") in {"", leaving.pairing}:
             await records.discard(self._tables, table, row)
 
-    async def _tell_broker(self, agent_id: str, leaving: Departure) -> None:
+    async def _clean_broker(self, agent_id: str, leaving: Departure) -> None:
         """Disconnect the agent, then clear its retained messages, including its will, but not new ones."""
-        _, now = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
+        _, current = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
         if leaving.why != "removed":
             if leaving.why == "unpaired":
                 await self._certificates.revoke(agent_id)
-            elif now is not None and now.space is not None:
-                await self._certificates.set_space(agent_id, now.space)
+            elif current is not None and current.space is not None:
+                await self._certificates.set_space(agent_id, current.space)
             await self._access.revoke(principal=f"agent:{agent_id}")
         if leaving.why == "unpaired":
             for name in leaving.devices:
                 await self._end_shares(device_id(agent_id, name), leaving.pairing)
         _, agent = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
-        back = agent if agent is not None and agent.space == leaving.space else None
-        if back is None:
+        existing = agent if agent is not None and agent.space == leaving.space else None
+        if existing is None:
             await self._bus.publish(topics.conn(leaving.space, agent_id), b"", retain=True)
         for name in leaving.devices:
-            if back is not None and back.device(name) is not None:
+            if existing is not None and existing.device(name) is not None:
                 continue
             for kind, stream in _RETAINED:
                 topic = topics.device(leaving.space, agent_id, name, kind, stream)
@@ -189,15 +189,15 @@ class Offboarding:
                 await self._tables.delete(records.SHARES, row)
                 await records.remove(self._tables, records.MEMBERS, share.account, f"share:{on}")
 
-    async def _strike(self, agent_id: str, done: Iterable[Departure]) -> None:
-        gone = set(done)
+    async def _remove_departures(self, agent_id: str, done: Iterable[Departure]) -> None:
+        completed = set(done)
 
         async def attempt() -> None:
             row = await self._tables.get(records.AGENTS, agent_id, "agent")
             if row is None:
                 return
             agent = records.read(row, Agent)
-            left = tuple(leaving for leaving in agent.leaving if leaving not in gone)
+            left = tuple(leaving for leaving in agent.leaving if leaving not in completed)
             created = records.to_data(replace(agent, leaving=left))
             await self._tables.replace(records.AGENTS, Row(agent_id, "agent", created, row.etag))
 

@@ -56,19 +56,19 @@ class Unpair:
         return changed
 
     async def _change(self, caller: Identity, agent_id: str, rule: Callable[[Agent], Agent], change: Change) -> Agent:
-        watched = False
+        scheduled = False
 
         async def attempt() -> Agent:
-            nonlocal watched
+            nonlocal scheduled
             row, agent = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
             if row is None or agent is None or agent.account != caller.account:
                 raise not_found("agent", agent_id)
             changed = rule(agent)
             if changed is not agent:
-                if not watched:
+                if not scheduled:
                     await self._offboarding.watch(agent_id)
-                    watched = True
-                await change.noted()
+                    scheduled = True
+                await change.store_pending()
                 await self._tables.replace(records.AGENTS, Row(agent_id, "agent", records.to_data(changed), row.etag))
             return changed
 

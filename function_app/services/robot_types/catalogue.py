@@ -20,7 +20,7 @@ from function_app.ports.model_compiler import ModelReport
 from function_app.ports.robot_catalogue import RobotCatalogue
 from function_app.ports.tables import Tables
 from function_app.services.robot_types.integrity import IntegritySeals, require_intact
-from function_app.services.robot_types.rows import INDEX, LOOKED, Place, place, read_head, read_version
+from function_app.services.robot_types.rows import INDEX, REPORT, Place, place, read_head, read_version
 from function_app.services.storage import records
 
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
@@ -162,7 +162,7 @@ class RobotTypes:
         Raises:
             Problem: ``model-unknown``.
         """
-        content = await self._blobs.get(where.prefix(version.version) + LOOKED)
+        content = await self._blobs.get(where.prefix(version.version) + REPORT)
         if content is None:
             raise not_found("model", version.manifest["type"])
         return _model(version.manifest["type"], msgspec.json.decode(content, type=ModelReport))
@@ -193,11 +193,13 @@ class RobotTypes:
         _, newest = await read_version(self._tables, where, head.last)
         if newest is None:
             return None
-        used = newest
+        version = newest
         if head.ready not in {0, head.last}:
             _, ready = await read_version(self._tables, where, head.ready)
-            used = ready or newest
-        return KnownType(_manifest(used.manifest), used.version, used.files, usable=head.ready > 0, upload=newest)
+            version = ready or newest
+        return KnownType(
+            _manifest(version.manifest), version.version, version.files, usable=head.ready > 0, upload=newest
+        )
 
     async def _head(self, caller: Identity, robot_type: str) -> tuple[Place, TypeHead]:
         where = place(caller, robot_type)
@@ -207,19 +209,19 @@ class RobotTypes:
         return where, head
 
 
-def _model(robot_type: str, looked: ModelReport) -> Model:
-    if looked.twin is None:
+def _model(robot_type: str, report: ModelReport) -> Model:
+    if report.twin is None:
         raise not_found("model", robot_type)
-    return Model(looked.twin, looked.actuators, looked.cameras)
+    return Model(report.twin, report.actuators, report.cameras)
 
 
 def _zip(files: Mapping[str, bytes]) -> bytes:
-    held = io.BytesIO()
-    with zipfile.ZipFile(held, "w") as archive:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
         for name, content in files.items():
             entry = zipfile.ZipInfo(name, _ZIP_TIME)  # fixed time: equal files give equal archives
             archive.writestr(entry, content, zipfile.ZIP_DEFLATED)
-    return held.getvalue()
+    return buffer.getvalue()
 
 
 def _manifest(fields: dict[str, Any]) -> RobotType:

@@ -19,19 +19,19 @@ from function_app.services.robot_types.rows import (
     read_head,
     schedule_check,
 )
-from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_LOOK_MS
+from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_PREVIEW_MS
 from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS
 
-AGAIN_MS = 30_000
+RETRY_MS = 30_000
 LONGEST_MS = 5 * GIVE_UP_MS
 """Maximum time that an upload waits while validators are busy."""
 NOTES = 25
-NO_CHECKER = (
+NO_VALIDATOR = (
     "No validator checked the model in time. Run `python -m function_app work` or `check-models` on a machine with "
     "MuJoCo, then upload it again."
 )
-CUT_OFF = "The upload was interrupted. Upload it again."
+INTERRUPTED = "The upload was interrupted. Upload it again."
 
 _log = logging.getLogger(__name__)
 
@@ -54,47 +54,47 @@ class RobotTypeCleanup:
         page = await self._tables.query(records.MODEL_CHECKS, LOOKS, last=last, limit=NOTES)
         for note in page.rows:
             try:
-                await self._look(place_of(note.key))
+                await self._check(place_of(note.key))
             except Problem as problem:
                 _log.warning("robot types: %s", problem.detail)
                 continue
             await records.discard(self._tables, records.MODEL_CHECKS, note)
 
-    async def _look(self, where: Place) -> None:
+    async def _check(self, where: Place) -> None:
         _, head = await read_head(self._tables, where)
         if head is None:
             if where.trial:
-                await self._forget(where)
+                await self._unlist(where)
             return
         page = await self._tables.query(
             records.ROBOT_TYPES, where.partition, first=VERSIONS, last=VERSIONS + "\x7f", limit=1000
         )
         if where.trial:
-            await self._look_at_trial(where, head, page.rows)
+            await self._check_preview(where, head, page.rows)
             return
         for row in page.rows:
-            await self._look_at(where, head, row)
+            await self._check_version(where, head, row)
 
-    async def _look_at_trial(self, where: Place, head: TypeHead, rows: Sequence[Row]) -> None:
+    async def _check_preview(self, where: Place, head: TypeHead, rows: Sequence[Row]) -> None:
         """Check a preview: expire its version, then delete all of it, its index last."""
         now_ms = self._clock.now_ms()
         versions = [records.read(row, TypeVersion) for row in rows]
-        if not head.deleted and any(now_ms < version.created_ms + KEEP_LOOK_MS for version in versions):
+        if not head.deleted and any(now_ms < version.created_ms + KEEP_PREVIEW_MS for version in versions):
             for version in versions:
                 if version.open:
-                    await self._judge(where, version, now_ms)
+                    await self._reject_if_overdue(where, version, now_ms)
             return
         for row, version in zip(rows, versions, strict=True):
             await self._drop(where, row, version)
         last, _ = await read_head(self._tables, where)
         await records.discard(self._tables, records.ROBOT_TYPES, last)
-        await self._forget(where)
+        await self._unlist(where)
 
-    async def _forget(self, where: Place) -> None:
+    async def _unlist(self, where: Place) -> None:
         """Remove a preview from its account's list."""
         await records.remove(self._tables, records.MEMBERS, where.account, preview_index(where))
 
-    async def _look_at(self, where: Place, head: TypeHead, row: Row) -> None:
+    async def _check_version(self, where: Place, head: TypeHead, row: Row) -> None:
         version = records.read(row, TypeVersion)
         now_ms = self._clock.now_ms()
         if version.state == "rejected" and version.version < head.last:
@@ -107,16 +107,16 @@ class RobotTypeCleanup:
             else:
                 await schedule_check(self._tables, where, due_ms)
         elif version.open:
-            await self._judge(where, version, now_ms)
+            await self._reject_if_overdue(where, version, now_ms)
 
-    async def _judge(self, where: Place, version: TypeVersion, now_ms: int) -> None:
+    async def _reject_if_overdue(self, where: Place, version: TypeVersion, now_ms: int) -> None:
         age_ms = now_ms - version.created_ms
         if age_ms < GIVE_UP_MS:
             await schedule_check(self._tables, where, version.created_ms + GIVE_UP_MS)
         elif version.state == "checking" and age_ms < LONGEST_MS and await self._busy(now_ms):
-            await schedule_check(self._tables, where, now_ms + AGAIN_MS)
+            await schedule_check(self._tables, where, now_ms + RETRY_MS)
         else:
-            why = CUT_OFF if version.state == "uploading" else NO_CHECKER
+            why = INTERRUPTED if version.state == "uploading" else NO_VALIDATOR
             await store_verdict(self._tables, where, version.version, (why,), now_ms)
 
     async def _busy(self, now_ms: int) -> bool:

@@ -59,9 +59,9 @@ class RobotTypeDeletion:
                 raise not_found("robot-type", robot_type)
             await self._require_unused(caller, robot_type)
             await schedule_check(self._tables, where, self._clock.now_ms() + AFTER_MS)
-            await change.noted()
-            gone = replace(head, deleted=True, ready=0, manifest={})
-            await records.update(self._tables, records.ROBOT_TYPES, row, gone)
+            await change.store_pending()
+            deleted = replace(head, deleted=True, ready=0, manifest={})
+            await records.update(self._tables, records.ROBOT_TYPES, row, deleted)
 
         async with self._audit_log.change(
             caller.account, AccountEvent.ROBOT_TYPE_DELETED, caller, on=robot_type

@@ -31,18 +31,18 @@ class IntegritySeals:
         signature = signing.sign_text(text, key, context=_CONTEXT)
         return replace(upload, seal=Seal(signing.key_id(key.public_key()), signature, hashes))
 
-    async def check(self, account: str, robot_type: str, used: TypeHead | TypeVersion) -> Seal:
+    async def check(self, account: str, robot_type: str, stored: TypeHead | TypeVersion) -> Seal:
         """The seal, if it is valid for this manifest.
 
         Raises:
             Problem: ``robot-type-damaged``.
         """
-        version = used.ready if isinstance(used, TypeHead) else used.version
-        seal = used.seal
+        version = stored.ready if isinstance(stored, TypeHead) else stored.version
+        seal = stored.seal
         key = (await self._keys.archive()).get(seal.key)
         if key is None:
             raise _damaged(robot_type, "was signed with an unknown or leaked key")
-        text = _text(account, robot_type, version, used.manifest, seal.hashes)
+        text = _text(account, robot_type, version, stored.manifest, seal.hashes)
         try:
             signing.verify_text(text, seal.signature, key, context=_CONTEXT)
         except SignatureError as error:
@@ -61,8 +61,8 @@ def require_intact(robot_type: str, seal: Seal, name: str, content: bytes) -> No
 
 
 def _text(account: str, robot_type: str, version: int, manifest: Mapping[str, Any], hashes: Mapping[str, str]) -> str:
-    said = {"account": account, "type": robot_type, "version": version, "manifest": manifest, "files": hashes}
-    return json.dumps(said, sort_keys=True, separators=(",", ":"))
+    fields = {"account": account, "type": robot_type, "version": version, "manifest": manifest, "files": hashes}
+    return json.dumps(fields, sort_keys=True, separators=(",", ":"))
 
 
 def _damaged(robot_type: str, how: str) -> Problem:

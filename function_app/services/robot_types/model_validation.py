@@ -17,7 +17,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.model_compiler import CompilerMissingError, ModelCompiler, ModelReport
 from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services.robot_types.package_reader import malformed, missing
-from function_app.services.robot_types.rows import CHECKS, HEAD, LOOKED, Place, read_head, read_version, schedule_check
+from function_app.services.robot_types.rows import CHECKS, HEAD, REPORT, Place, read_head, read_version, schedule_check
 from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS
 
@@ -84,18 +84,18 @@ class ModelValidator:
         _, upload = await read_version(self._tables, where, number)
         if upload is not None and upload.state == "checking":
             if note.data["tries"] > MAX_TRIES:
-                looked = ModelReport((f"The validation was interrupted {MAX_TRIES} times. Simplify the model.",))
+                report = ModelReport((f"The validation was interrupted {MAX_TRIES} times. Simplify the model.",))
             else:
-                looked = await self._look(where, upload)
+                report = await self._compile(where, upload)
             # The drawing is stored first: a ready version has one.
-            await self._blobs.put(where.prefix(number) + LOOKED, msgspec.json.encode(looked))
-            warnings = _sentences(looked.warnings)
-            await store_verdict(self._tables, where, number, looked.errors, self._clock.now_ms(), warnings=warnings)
+            await self._blobs.put(where.prefix(number) + REPORT, msgspec.json.encode(report))
+            warnings = _sentences(report.warnings)
+            await store_verdict(self._tables, where, number, report.errors, self._clock.now_ms(), warnings=warnings)
             _, upload = await read_version(self._tables, where, number)
         if upload is None:
             await drop_files(self._blobs, where, number)  # the cleanup may have run concurrently
 
-    async def _look(self, where: Place, upload: TypeVersion) -> ModelReport:
+    async def _compile(self, where: Place, upload: TypeVersion) -> ModelReport:
         names = list(upload.files)
         contents = await asyncio.gather(*(self._blobs.get(where.prefix(upload.version) + name) for name in names))
         files = {name: content for name, content in zip(names, contents, strict=True) if content is not None}
@@ -103,12 +103,12 @@ class ModelValidator:
             return ModelReport(("A file of the upload is missing. Upload it again.",))
         manifest = msgspec.convert(upload.manifest, RobotType)
         del files[MANIFEST]
-        lost = missing(files)
-        looked = await self._compiler.check(manifest, files, [name for _, name, _ in lost])
-        told = [error for error in looked.errors if not any(name in error for _, name, _ in lost)]
-        torn = [error for error in malformed(files) if not any(_file(one) == _file(error) for one in told)]
-        named = [f"{file}: '{name}' is not among the files (line {line})" for file, name, line in lost]
-        return replace(looked, errors=(*told, *named, *torn))
+        missing_files = missing(files)
+        report = await self._compiler.check(manifest, files, [name for _, name, _ in missing_files])
+        known = [error for error in report.errors if not any(name in error for _, name, _ in missing_files)]
+        malformed_files = [error for error in malformed(files) if not any(_file(one) == _file(error) for one in known)]
+        references = [f"{file}: '{name}' is not among the files (line {line})" for file, name, line in missing_files]
+        return replace(report, errors=(*known, *references, *malformed_files))
 
 
 async def drop_files(blobs: Blobs, where: Place, number: int) -> None:

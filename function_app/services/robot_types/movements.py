@@ -31,7 +31,7 @@ from function_app.services.storage.retention import DAY_MS, Retention
 
 MAX_OWN = 1_000
 """Maximum number of movements of an account for one robot type."""
-KEPT_MS = 3 * DAY_MS
+KEEP_SCRIPT_MS = 3 * DAY_MS
 """Time that the script of a deleted movement remains, for republished commands of running actions."""
 _VERSIONS = "~"
 """Key prefix of version rows, which sort after all names."""
@@ -92,15 +92,15 @@ class Movements:
         page = await self._tables.query(records.MOVEMENTS, partition, first=after, last=_VERSIONS, limit=limit)
         own = {row.key: records.read(row, Movement) for row in page.rows}
         end = None if page.cursor is None else page.rows[-1].key
-        shown = {
+        visible = {
             name: await self._built_in(robot_type, item)
             for name, item in (await self._catalogue.movements(robot_type)).items()
             if after <= name and (end is None or name <= end)
         }
-        shown |= {name: movement for name, movement in own.items() if not movement.deleted}
-        names = sorted(shown)
+        visible |= {name: movement for name, movement in own.items() if not movement.deleted}
+        names = sorted(visible)
         last = names[limit - 1] if len(names) > limit else end
-        return tuple(shown[name] for name in names[:limit]), last
+        return tuple(visible[name] for name in names[:limit]), last
 
     async def versions(
         self, caller: Identity, robot_type: str, name: str, *, cursor: str | None, limit: int
@@ -173,7 +173,7 @@ class Movements:
             author=caller.account,
             parameters_schema=script.schema if draft.parameters_schema is None else draft.parameters_schema,
         )
-        lost: list[Movement] = []
+        orphans: list[Movement] = []
 
         async def attempt() -> tuple[Movement, bool]:
             row = await self._row(caller, robot_type, name)
@@ -182,14 +182,14 @@ class Movements:
             if row is None:
                 await self._check_room(caller, robot_type)
             elif old is not None and old.deleted:
-                await self._forget_versions(caller, robot_type, old)
+                await self._schedule_version_deletion(caller, robot_type, old)
             numbered = await self._scripts.sign(robot_type, await self._numbered(robot_type, new, old))
             await self._scripts.put(caller, robot_type, numbered, draft.source)
-            lost.append(numbered)
+            orphans.append(numbered)
             change.data["version"] = numbered.version
-            await change.noted()
+            await change.store_pending()
             await self._tables.batch(records.MOVEMENTS, _writes(_partition(caller, robot_type), numbered, row))
-            lost.pop()
+            orphans.pop()
             return numbered, old is None or old.deleted
 
         on = f"{robot_type}/{name}"
@@ -197,8 +197,8 @@ class Movements:
             caller.account, AccountEvent.MOVEMENT_SAVED, caller, on=on, sha256=new.sha256
         ) as change:
             done = await records.retry(attempt)
-        for tried in lost:
-            await self._drop_lost(caller, robot_type, tried)
+        for movement in orphans:
+            await self._drop_orphan(caller, robot_type, movement)
         return done
 
     async def delete(self, caller: Identity, robot_type: str, name: str) -> None:
@@ -216,21 +216,21 @@ class Movements:
             old = records.read(row, Movement) if row else None
             if row is None or old is None or old.deleted:
                 if old is not None:
-                    await self._forget_versions(caller, robot_type, old)
+                    await self._schedule_version_deletion(caller, robot_type, old)
                 if name in await self._catalogue.movements(robot_type):
                     detail = f"'{name}' is part of the robot type and cannot be deleted."
                     raise Problem("movement-built-in", 409, "Built-in", detail)
                 raise not_found("movement", name)
-            gone = replace(old, deleted=True, updated_ms=self._clock.now_ms())
-            await change.noted()
-            await records.update(self._tables, records.MOVEMENTS, row, gone)
-            return gone
+            deleted = replace(old, deleted=True, updated_ms=self._clock.now_ms())
+            await change.store_pending()
+            await records.update(self._tables, records.MOVEMENTS, row, deleted)
+            return deleted
 
         async with self._audit_log.change(
             caller.account, AccountEvent.MOVEMENT_DELETED, caller, on=f"{robot_type}/{name}"
         ) as change:
-            gone = await records.retry(attempt)
-        await self._forget_versions(caller, robot_type, gone)
+            deleted = await records.retry(attempt)
+        await self._schedule_version_deletion(caller, robot_type, deleted)
 
     async def own(self, caller: Identity, robot_type: str) -> tuple[str, ...]:
         """Names of the account's own movements for a robot type."""
@@ -277,8 +277,10 @@ class Movements:
         newest = old.version if old and not old.deleted else built_in.version if built_in else 0
         if based_on is None or based_on == newest:
             return
-        made = f"Version {newest} of '{name}' is the newest" if newest else f"'{name}' has been deleted meanwhile"
-        detail = f"{made}, but this draft is based on version {based_on}." if based_on else f"'{name}' exists already."
+        reason = f"Version {newest} of '{name}' is the newest" if newest else f"'{name}' has been deleted meanwhile"
+        detail = (
+            f"{reason}, but this draft is based on version {based_on}." if based_on else f"'{name}' exists already."
+        )
         raise Problem(
             "movement-changed", 409, "The movement was changed concurrently", detail, extras={"version": newest}
         )
@@ -296,18 +298,18 @@ class Movements:
         version = max(old.version if old else 0, built_in.version if built_in else 0) + 1
         return replace(new, version=version, since=old.since if old and not old.deleted else version)
 
-    async def _drop_lost(self, caller: Identity, robot_type: str, tried: Movement) -> None:
+    async def _drop_orphan(self, caller: Identity, robot_type: str, movement: Movement) -> None:
         """Delete the script of a version number that another request got, unless it is the same script."""
-        key = _version_key(tried.name, tried.version)
+        key = _version_key(movement.name, movement.version)
         row = await self._tables.get(records.MOVEMENTS, _partition(caller, robot_type), key)
-        if row is None or row.data["sha256"] != tried.sha256:
-            await self._scripts.delete(caller, robot_type, tried)
+        if row is None or row.data["sha256"] != movement.sha256:
+            await self._scripts.delete(caller, robot_type, movement)
 
-    async def _forget_versions(self, caller: Identity, robot_type: str, gone: Movement) -> None:
+    async def _schedule_version_deletion(self, caller: Identity, robot_type: str, deleted: Movement) -> None:
         """Schedule the deletion of scripts, then of rows. Idempotent."""
-        due_ms = gone.updated_ms + KEPT_MS
+        due_ms = deleted.updated_ms + KEEP_SCRIPT_MS
         partition = _partition(caller, robot_type)
-        first, last = _version_key(gone.name, gone.version), _version_key(gone.name, gone.since) + "\0"
+        first, last = _version_key(deleted.name, deleted.version), _version_key(deleted.name, deleted.since) + "\0"
         start: str | None = first
         while start is not None:
             page = await self._tables.query(records.MOVEMENTS, partition, first=start, last=last)
@@ -320,7 +322,7 @@ class Movements:
         script = self._read.get(item.sha256)
         if script is None:
             script = self._read[item.sha256] = read_script(item.source)
-        shown = Movement(
+        movement = Movement(
             name=item.name,
             description=item.description,
             version=item.version,
@@ -330,7 +332,7 @@ class Movements:
             author=SHIPPED,
             parameters_schema=script.schema,
         )
-        return await self._scripts.sign(robot_type, shown)
+        return await self._scripts.sign(robot_type, movement)
 
 
 def _writes(partition: str, movement: Movement, row: Row | None) -> list[Write]:

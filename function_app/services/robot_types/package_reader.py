@@ -21,7 +21,7 @@ MAX_BYTES = 6_000_000
 """Maximum size of all files [bytes]."""
 MAX_MANIFEST = 48_000
 MAX_VERSION = 1_000_000
-MAX_TOLD = 20
+MAX_REPORTED = 20
 """Maximum number of reported errors."""
 TEXT = ".xml"
 BINARY = (".stl", ".obj", ".png")
@@ -53,22 +53,22 @@ def read_upload(manifest: str, files: Mapping[str, str]) -> Upload:
     """
     if not 1 <= len(files) <= MAX_FILES:
         raise _bad(f"A robot type has 1 to {MAX_FILES} files, not {len(files)}.")
-    wrong: list[Problem] = []
-    robot_type = _or_note(wrong, partial(_manifest, manifest))
+    problems: list[Problem] = []
+    robot_type = _or_record_error(problems, partial(_manifest, manifest))
     content: dict[str, bytes] = {}
     for name, text in files.items():
-        read = _or_note(wrong, partial(_content, name, text))
+        read = _or_record_error(problems, partial(_content, name, text))
         if read is not None:
             content[name] = read
-    wrong += _unfit(content)
+    problems += _content_errors(content)
     if robot_type is not None:
-        wrong += _unnamed(robot_type, content)
-    for name, given in content.items():
+        problems += _reference_errors(robot_type, content)
+    for name, file_content in content.items():
         if name.endswith(TEXT):
-            _or_note(wrong, partial(_check_references, name, given))
-    if wrong or robot_type is None:
-        errors = [problem.detail for problem in wrong][:MAX_TOLD]
-        raise invalid(errors[0], code=wrong[0].code, errors=errors)
+            _or_record_error(problems, partial(_check_references, name, file_content))
+    if problems or robot_type is None:
+        errors = [problem.detail for problem in problems][:MAX_REPORTED]
+        raise invalid(errors[0], code=problems[0].code, errors=errors)
     return Upload(robot_type, {manifests.MANIFEST: manifest.encode(), **content})
 
 
@@ -77,19 +77,19 @@ def missing(files: Mapping[str, bytes]) -> tuple[tuple[str, str, int], ...]:
     existing = {name.rpartition("/")[2] for name in files}
     result: list[tuple[str, str, int]] = []
 
-    def look(name: str, parser: expat.XMLParserType) -> None:
+    def watch_references(name: str, parser: expat.XMLParserType) -> None:
         def element(_: str, attributes: dict[str, str]) -> None:
             for attribute, value in attributes.items():
-                wanted = value.rpartition("/")[2]
-                if _FILE.match(attribute) and wanted and wanted not in existing:
-                    result.append((name, wanted, parser.CurrentLineNumber))
+                file_name = value.rpartition("/")[2]
+                if _FILE.match(attribute) and file_name and file_name not in existing:
+                    result.append((name, file_name, parser.CurrentLineNumber))
 
         parser.StartElementHandler = element
 
     for name, text in files.items():
         if name.endswith(TEXT):
             parser = _parser()
-            look(name, parser)
+            watch_references(name, parser)
             with contextlib.suppress(expat.ExpatError):
                 parser.Parse(text, True)
     return tuple(result)
@@ -107,7 +107,7 @@ def malformed(files: Mapping[str, bytes]) -> tuple[str, ...]:
     return tuple(errors)
 
 
-def _unfit(content: Mapping[str, bytes]) -> Iterator[Problem]:
+def _content_errors(content: Mapping[str, bytes]) -> Iterator[Problem]:
     if sum(map(len, content.values())) > MAX_BYTES:
         yield _bad(f"All files together have at most {MAX_BYTES} bytes. Simplify the meshes.")
     for name in content:
@@ -116,20 +116,20 @@ def _unfit(content: Mapping[str, bytes]) -> Iterator[Problem]:
             yield _bad(f"'{folder}' cannot be a file and a folder.")
 
 
-def _unnamed(robot_type: RobotType, content: Mapping[str, bytes]) -> Iterator[Problem]:
+def _reference_errors(robot_type: RobotType, content: Mapping[str, bytes]) -> Iterator[Problem]:
     for field in ("model", "scene"):
-        named = getattr(robot_type, field)
-        if named not in content or not named.endswith(TEXT):
+        file_name = getattr(robot_type, field)
+        if file_name not in content or not file_name.endswith(TEXT):
             existing = _xml_names(content)
-            yield _bad_manifest(f"{field} is '{named[:120]}'; it must be one of the .xml files: {existing}.")
+            yield _bad_manifest(f"{field} is '{file_name[:120]}'; it must be one of the .xml files: {existing}.")
 
 
-def _or_note(wrong: list[Problem], read: Callable[[], T]) -> T | None:
+def _or_record_error(problems: list[Problem], read: Callable[[], T]) -> T | None:
     """The result of ``read``, or ``None`` after recording its error."""
     try:
         return read()
     except Problem as problem:
-        wrong.append(problem)
+        problems.append(problem)
         return None
 
 
@@ -166,7 +166,9 @@ def _check_references(name: str, text: bytes) -> None:
     def element(tag: str, attributes: dict[str, str]) -> None:
         for attribute, value in attributes.items():
             if (_FILE.match(attribute) or attribute.lower() in _FOLDERS) and _OUTSIDE.search(value):
-                outside.append(f'{name}: <{tag} {attribute}="{value[:120]}"> leads out of the robot type\'s folder.')
+                outside.append(
+                    f'{name}: <{tag} {attribute}="{value[:120]}"> leads out of the robot type\'s folder.'
+                )
 
     def doctype(*_: object) -> None:
         outside.append(f"{name}: a DOCTYPE is not allowed.")

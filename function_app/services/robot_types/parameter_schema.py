@@ -84,18 +84,18 @@ class ObjectSchema(_Value, frozen=True, kw_only=True, tag="object"):
 ValueSchema = NumberSchema | IntegerSchema | StringSchema | BooleanSchema | ArraySchema | ObjectSchema
 
 
-def schema_of(given: Any) -> ObjectSchema:
+def schema_of(data: Any) -> ObjectSchema:
     """A schema from JSON.
 
     Raises:
         Problem: ``schema-invalid``, with the place and the allowed values.
     """
-    if too_deep(given, SCHEMA_LEVELS):
+    if too_deep(data, SCHEMA_LEVELS):
         raise _bad_schema(f"It is nested more than {SCHEMA_LEVELS} levels deep.")
     try:
-        schema = msgspec.convert(given, ObjectSchema, strict=True)
+        schema = msgspec.convert(data, ObjectSchema, strict=True)
     except msgspec.ValidationError as error:
-        raise _bad_schema(f"{_named(given) or error}.") from error
+        raise _bad_schema(f"{_invalid_parameter(data) or error}.") from error
     check_schema(schema)
     return schema
 
@@ -130,20 +130,20 @@ def check_schema(schema: ObjectSchema) -> None:
     _check(result, "$")
 
 
-def fit(schema: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str, Any]:
+def fit(schema: Mapping[str, Any] | None, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters with defaults. Without a schema all parameters are accepted.
 
     Args:
         schema: Result of ``plain``.
-        given: Parameters of the operator.
+        parameters: Parameters of the operator.
 
     Raises:
         Problem: ``parameters-invalid``, with the place and the allowed values.
     """
-    check(given)
+    check(parameters)
     if schema is None:
-        return dict(given)
-    filled: dict[str, Any] = _filled(schema, given)
+        return dict(parameters)
+    filled: dict[str, Any] = _filled(schema, parameters)
     _check_size(filled)
     error = _first_error(schema, filled)
     if error is not None:
@@ -152,9 +152,9 @@ def fit(schema: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str,
     return filled
 
 
-def _named(given: Any) -> str:
+def _invalid_parameter(data: Any) -> str:
     """The first invalid parameter by name, which the error of the whole schema does not contain."""
-    properties = given.get("properties") if isinstance(given, dict) else None
+    properties = data.get("properties") if isinstance(data, dict) else None
     for name, value in properties.items() if isinstance(properties, dict) else ():
         try:
             msgspec.convert(value, ValueSchema, strict=True)
@@ -169,15 +169,15 @@ def _check_size(parameters: Mapping[str, Any]) -> None:
         raise _bad_parameters(f"Parameters with their defaults have at most {MAX_PARAMETERS_BYTES} bytes, not {size}.")
 
 
-def check(given: Mapping[str, Any]) -> None:
+def check(parameters: Mapping[str, Any]) -> None:
     """Reject parameters that no script accepts.
 
     Raises:
         Problem: ``parameters-invalid``: nested too deeply or too large.
     """
-    if too_deep(given):
+    if too_deep(parameters):
         raise _bad_parameters(f"The parameters are nested more than {MAX_LEVELS} levels deep.")
-    _check_size(given)
+    _check_size(parameters)
 
 
 def _filled(schema: Mapping[str, Any], value: Any) -> Any:

@@ -17,10 +17,10 @@ from function_app.ports.robot_catalogue import RobotCatalogue
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.robot_types.catalogue import KnownType, Model, RobotTypes
 from function_app.services.robot_types.integrity import IntegritySeals, require_intact
-from function_app.services.robot_types.package_reader import MAX_TOLD, Upload, read_upload
+from function_app.services.robot_types.package_reader import MAX_REPORTED, Upload, read_upload
 from function_app.services.robot_types.rows import (
     HEAD,
-    TRIALS,
+    PREVIEWS,
     Place,
     preview_index,
     preview_place,
@@ -31,12 +31,12 @@ from function_app.services.robot_types.rows import (
 )
 from function_app.services.robot_types.script_metadata import read_script
 from function_app.services.robot_types.upload import RobotTypeUpload, require_own
-from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_LOOK_MS, TypeVersions, refused
+from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_PREVIEW_MS, TypeVersions, refused
 from function_app.services.storage import records
 
-MAX_LOOKS = 4
+MAX_PREVIEWS = 4
 """Maximum number of previews per account; a new one replaces the oldest."""
-_ONLY = 1
+_VERSION = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Preview:
     @property
     def expires_ms(self) -> int:
         """Expiry time [ms since 1970]."""
-        return self.upload.created_ms + KEEP_LOOK_MS
+        return self.upload.created_ms + KEEP_PREVIEW_MS
 
 
 class RobotTypePreview:
@@ -85,57 +85,57 @@ class RobotTypePreview:
         Raises:
             Problem: ``manifest-invalid``, ``robot-type-invalid`` with ``errors``, ``robot-type-built-in``.
         """
-        wrong = _wrong_scripts(scripts)
+        errors = _script_errors(scripts)
         try:
-            given = read_upload(manifest, files)
+            package = read_upload(manifest, files)
         except Problem as problem:
-            problem.extras["errors"] = [*problem.extras.get("errors", [problem.detail]), *wrong][:MAX_TOLD]
+            problem.extras["errors"] = [*problem.extras.get("errors", [problem.detail]), *errors][:MAX_REPORTED]
             raise
-        await require_own(self._catalogue, given.robot_type.type)
+        await require_own(self._catalogue, package.robot_type.type)
         where = Place(caller.account, f"~{new_id()}")
         now_ms = self._clock.now_ms()
-        await schedule_check(self._tables, where, now_ms + KEEP_LOOK_MS)
+        await schedule_check(self._tables, where, now_ms + KEEP_PREVIEW_MS)
         await schedule_check(self._tables, where, now_ms + GIVE_UP_MS)
         await self._list(where, now_ms)
-        sizes = {name: len(content) for name, content in given.files.items()}
-        fields = msgspec.to_builtins(given.robot_type)
-        plain = TypeVersion(_ONLY, "uploading", fields, sizes, now_ms, errors=wrong)
-        upload = await self._integrity.sealed(where.account, where.type, plain, given.files)
-        head = Row(where.partition, HEAD, records.to_data(TypeHead(where.type, last=_ONLY, since=_ONLY)))
-        version = Row(where.partition, version_key(_ONLY), records.to_data(upload))
+        sizes = {name: len(content) for name, content in package.files.items()}
+        fields = msgspec.to_builtins(package.robot_type)
+        plain = TypeVersion(_VERSION, "uploading", fields, sizes, now_ms, errors=errors)
+        upload = await self._integrity.sealed(where.account, where.type, plain, package.files)
+        head = Row(where.partition, HEAD, records.to_data(TypeHead(where.type, last=_VERSION, since=_VERSION)))
+        version = Row(where.partition, version_key(_VERSION), records.to_data(upload))
         await self._tables.batch(records.ROBOT_TYPES, [Write("create", head), Write("create", version)])
-        await self._versions.store(where, _ONLY, given.files)
-        done = await self._versions.verdict(where, _ONLY, wait_ms)
-        return Preview(where.type[1:], done or upload, given.robot_type)
+        await self._versions.store(where, _VERSION, package.files)
+        done = await self._versions.verdict(where, _VERSION, wait_ms)
+        return Preview(where.type[1:], done or upload, package.robot_type)
 
     async def get(self, caller: Identity, look: str, *, wait_ms: int = 0) -> Preview:
-        """How it fares.
+        """A preview, after its validation or after ``wait_ms``.
 
         Raises:
             Problem: ``look-unknown``.
         """
         where, upload = await self._find(caller, look)
         if upload.open and wait_ms:
-            upload = await self._versions.verdict(where, _ONLY, wait_ms) or upload
+            upload = await self._versions.verdict(where, _VERSION, wait_ms) or upload
         return Preview(look, upload, msgspec.convert(upload.manifest, RobotType))
 
     async def model(self, caller: Identity, look: str) -> Model:
-        """What it was found to be.
+        """The drawing of a validated preview.
 
         Raises:
             Problem: ``look-unknown``, ``robot-type-not-ready``, ``model-unknown``.
         """
         where, upload = await self._find(caller, look)
-        _require_good(upload)
+        _require_ready(upload)
         return await self._types.checked_model(where, upload)
 
     async def save(self, caller: Identity, look: str, *, wait_ms: int) -> tuple[KnownType, bool]:
         """Save a preview as the next version of its robot type, which is validated like any upload."""
         where, upload = await self._find(caller, look)
-        _require_good(upload)
+        _require_ready(upload)
         seal = await self._integrity.check(where.account, where.type, upload)
         names = list(upload.files)
-        contents = await asyncio.gather(*(self._blobs.get(where.prefix(_ONLY) + name) for name in names))
+        contents = await asyncio.gather(*(self._blobs.get(where.prefix(_VERSION) + name) for name in names))
         files = {name: content or b"" for name, content in zip(names, contents, strict=True)}
         for name, content in files.items():
             require_intact(where.type, seal, name, content)
@@ -155,17 +155,19 @@ class RobotTypePreview:
             row, head = await read_head(self._tables, where)
             await schedule_check(self._tables, where, self._clock.now_ms())
             if row is not None and head is not None and not head.deleted:
-                gone = records.to_data(replace(head, deleted=True))
-                await self._tables.replace(records.ROBOT_TYPES, Row(row.partition, row.key, gone, row.etag))
+                deleted = records.to_data(replace(head, deleted=True))
+                await self._tables.replace(records.ROBOT_TYPES, Row(row.partition, row.key, deleted, row.etag))
 
         await records.retry(attempt)
 
     async def _list(self, where: Place, now_ms: int) -> None:
         """List a preview; the oldest ones beyond the limit expire."""
-        page = await self._tables.query(records.MEMBERS, where.account, first=TRIALS, last=TRIALS + "\x7f", limit=100)
-        there = sorted(page.rows, key=lambda row: row.data["created_ms"])
-        for row in there[: max(0, len(there) - MAX_LOOKS + 1)]:
-            await self._end(Place(where.account, "~" + row.key.removeprefix(TRIALS)))
+        page = await self._tables.query(
+            records.MEMBERS, where.account, first=PREVIEWS, last=PREVIEWS + "\x7f", limit=100
+        )
+        listed = sorted(page.rows, key=lambda row: row.data["created_ms"])
+        for row in listed[: max(0, len(listed) - MAX_PREVIEWS + 1)]:
+            await self._end(Place(where.account, "~" + row.key.removeprefix(PREVIEWS)))
         row = Row(where.account, preview_index(where), {"created_ms": now_ms})
         await self._tables.create(records.MEMBERS, row)
 
@@ -173,22 +175,24 @@ class RobotTypePreview:
         where = preview_place(caller, look)
         if where is not None:
             _, head = await read_head(self._tables, where)
-            _, upload = await read_version(self._tables, where, _ONLY)
-            live = upload is not None and self._clock.now_ms() < upload.created_ms + KEEP_LOOK_MS
+            _, upload = await read_version(self._tables, where, _VERSION)
+            live = upload is not None and self._clock.now_ms() < upload.created_ms + KEEP_PREVIEW_MS
             if upload is not None and live and head is not None and not head.deleted:
                 return where, upload
         raise not_found("robot-type-preview", look)
 
 
-def _require_good(upload: TypeVersion) -> None:
+def _require_ready(upload: TypeVersion) -> None:
     if upload.state == "rejected":
         raise refused(upload)
     if upload.state != "ready":
-        raise Problem("robot-type-not-ready", 409, "Not checked yet", "The upload is still being validated.")
+        raise Problem(
+            "robot-type-not-ready", 409, "The upload is not validated", "The upload is still being validated."
+        )
 
 
-def _wrong_scripts(scripts: Mapping[str, str]) -> tuple[str, ...]:
-    """Errors in movements that are found without running them."""
+def _script_errors(scripts: Mapping[str, str]) -> tuple[str, ...]:
+    """Errors in movement scripts, found without execution."""
     result = []
     for name, source in scripts.items():
         file = f"movements/{name[:80]}.py"

@@ -17,10 +17,10 @@ VERSIONS = "version:"
 CHECKS = "checks"
 LOOKS = "looks"
 INDEX = "type:"
-LOOKED = "looked.json"
+REPORT = "looked.json"
 """Name of the stored ``ModelReport`` of a version. No uploaded file can have this name."""
-TRIALS = "type-look:"
-_TRIAL = "~"
+PREVIEWS = "type-look:"
+_PREVIEW = "~"
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Place:
     @property
     def trial(self) -> bool:
         """Whether it is a preview; no robot type has such an id."""
-        return self.type.startswith(_TRIAL)
+        return self.type.startswith(_PREVIEW)
 
     @property
     def partition(self) -> str:
@@ -52,12 +52,12 @@ def place(caller: Identity, robot_type: str) -> Place | None:
 
 def preview_place(caller: Identity, look: str) -> Place | None:
     """The place of a preview, which is not found by type id."""
-    return Place(caller.account, _TRIAL + look) if ID.match(look) else None
+    return Place(caller.account, _PREVIEW + look) if ID.match(look) else None
 
 
 def preview_index(where: Place) -> str:
     """Row key in the account's list of previews."""
-    return TRIALS + where.type.removeprefix(_TRIAL)
+    return PREVIEWS + where.type.removeprefix(_PREVIEW)
 
 
 def version_key(version: int) -> str:

@@ -1,7 +1,6 @@
 """Static checks of movement scripts, without running them.
 
-An ``error`` prevents saving; a ``warning`` would most likely fail at the robot. Warnings require proof in the text:
-names built at run time are not followed.
+An ``error`` prevents saving; a ``warning`` would probably fail at the robot. Names computed at run time are not checked.
 """
 
 import ast
@@ -126,14 +125,14 @@ class _Reader:
             yield _mark("warning", node, f"There is no '{name}'.")
 
     def _attribute(self, node: ast.Attribute, owner: str, attribute: str) -> Iterator[LintMessage]:
-        value = self._given(owner)
+        value = self._builtin(owner)
         if value is None or not value.methods or attribute.startswith("__"):
             return
-        there = [*(each.name for each in value.methods), *(each.name for each in value.attributes)]
-        if attribute not in there:
-            yield _mark("warning", node, f"There is no {owner}.{attribute}; there are {', '.join(there)}.")
+        available = [*(each.name for each in value.methods), *(each.name for each in value.attributes)]
+        if attribute not in available:
+            yield _mark("warning", node, f"There is no {owner}.{attribute}; there are {', '.join(available)}.")
 
-    def _given(self, name: str) -> Value | None:
+    def _builtin(self, name: str) -> Value | None:
         return None if name in self._bound else self._values.get(name)
 
     def _called(self, function: ast.expr) -> Call | None:
@@ -141,7 +140,7 @@ class _Reader:
             case ast.Name(id=name) if name not in self._bound:
                 return self._functions.get(name)
             case ast.Attribute(value=ast.Name(id=owner), attr=name):
-                value = self._given(owner)
+                value = self._builtin(owner)
                 return next((each for each in value.methods if each.name == name), None) if value else None
         return None
 
@@ -154,19 +153,19 @@ class _Reader:
             yield from _wrong_arguments(node, call)
         by_name = {each.name: each for each in call.parameters}
         in_order = [each for each in call.parameters if each.kind == "positional"]
-        given = [*zip(in_order, node.args, strict=False)] if not spread else []
-        given += [(by_name[each.arg], each.value) for each in node.keywords if each.arg in by_name]
-        for parameter, value in given:
+        arguments = [*zip(in_order, node.args, strict=False)] if not spread else []
+        arguments += [(by_name[each.arg], each.value) for each in node.keywords if each.arg in by_name]
+        for parameter, value in arguments:
             if parameter.names is not UNSET:
                 yield from self._strings(value, parameter.names)
 
     def _strings(self, value: ast.expr, kind: str) -> Iterator[LintMessage]:
         """Literal names that the robot type does not define; a type without a list accepts all names."""
-        there = self._names.get(kind, ())
-        for text in _texts(value) if there else ():
+        available = self._names.get(kind, ())
+        for text in _texts(value) if available else ():
             name = str(text.value)
-            if name and name not in there:
-                message = f"This robot type has no {_ONE_OF[kind]} '{name}'; it has {', '.join(there)}."
+            if name and name not in available:
+                message = f"This robot type has no {_ONE_OF[kind]} '{name}'; it has {', '.join(available)}."
                 yield _mark("warning", text, message)
 
 
@@ -177,14 +176,14 @@ def _wrong_arguments(node: ast.Call, call: Call) -> Iterator[LintMessage]:
     existing = [each.name for each in call.parameters]
     if len(node.args) > len(order):
         yield _mark("warning", node.args[len(order)], f"Too many arguments: {call.signature}.")
-    given = {*order[: len(node.args)]}
+    arguments = {*order[: len(node.args)]}
     for each in node.keywords:
         if each.arg not in existing:
             yield _mark("warning", each, f"There is no argument '{each.arg}': {call.signature}.")
-        elif each.arg in given:
+        elif each.arg in arguments:
             yield _mark("warning", each, f"'{each.arg}' is given twice.")
-        given.add(str(each.arg))
-    missing = [each.name for each in call.parameters if each.default is UNSET and each.name not in given]
+        arguments.add(str(each.arg))
+    missing = [each.name for each in call.parameters if each.default is UNSET and each.name not in arguments]
     if missing:
         yield _mark("warning", node, f"Without {' and '.join(missing)}: {call.signature}.")
 

@@ -68,21 +68,21 @@ class RobotTypeUpload:
         """
         return await self.add(caller, read_upload(manifest, files), wait_ms=wait_ms)
 
-    async def add(self, caller: Identity, given: Upload, *, wait_ms: int) -> tuple[KnownType, bool]:
+    async def add(self, caller: Identity, package: Upload, *, wait_ms: int) -> tuple[KnownType, bool]:
         """Like ``upload``, for files that were already read."""
-        where = Place(caller.account, given.robot_type.type)
+        where = Place(caller.account, package.robot_type.type)
         await require_own(self._catalogue, where.type)
         await schedule_check(self._tables, where, self._clock.now_ms() + GIVE_UP_MS)
         await self._index(where)
         async with self._audit_log.change(
             caller.account, AccountEvent.ROBOT_TYPE_UPLOADED, caller, on=where.type
         ) as change:
-            version, new = await self._number(where, given, change)
+            version, new = await self._number(where, package, change)
         await self._index(where)
-        await self._versions.store(where, version, given.files)
-        done = await self._versions.verdict(where, version, wait_ms)
-        if done is not None and done.state == "rejected":
-            raise refused(done)
+        await self._versions.store(where, version, package.files)
+        checked = await self._versions.verdict(where, version, wait_ms)
+        if checked is not None and checked.state == "rejected":
+            raise refused(checked)
         return await self._types.view(caller, where.type), new
 
     async def _index(self, where: Place) -> None:
@@ -101,23 +101,23 @@ class RobotTypeUpload:
                 raise Problem("robot-types-full", 409, "Too many robot types", detail)
             await self._tables.create(records.MEMBERS, Row(where.account, key, {}))
 
-    async def _number(self, where: Place, given: Upload, change: Change) -> tuple[int, bool]:
+    async def _number(self, where: Place, package: Upload, change: Change) -> tuple[int, bool]:
         """Assign the next version number."""
-        manifest = msgspec.to_builtins(given.robot_type)
-        sizes = {name: len(content) for name, content in given.files.items()}
+        manifest = msgspec.to_builtins(package.robot_type)
+        sizes = {name: len(content) for name, content in package.files.items()}
 
         async def attempt() -> tuple[int, bool]:
             row, head = await read_head(self._tables, where)
             if head is not None and not head.deleted:
                 await self._require_no_other(where, head)
-            following = next_version(head, given.robot_type.version, where.type)
+            following = next_version(head, package.robot_type.version, where.type)
             plain = TypeVersion(following.last, "uploading", manifest, sizes, self._clock.now_ms())
-            upload = await self._integrity.sealed(where.account, where.type, plain, given.files)
+            upload = await self._integrity.sealed(where.account, where.type, plain, package.files)
             new_head = Row(where.partition, HEAD, records.to_data(following), row.etag if row else "")
             new_version = Row(where.partition, version_key(following.last), records.to_data(upload))
             writes = [Write("replace" if row else "create", new_head), Write("create", new_version)]
             change.data["version"] = following.last
-            await change.noted()
+            await change.store_pending()
             await self._tables.batch(records.ROBOT_TYPES, writes)
             return following.last, head is None or head.deleted
 
@@ -127,7 +127,7 @@ class RobotTypeUpload:
         _, newest = await read_version(self._tables, where, head.last)
         if newest is not None and newest.open:
             detail = f"Version {newest.version} of '{where.type}' is still being validated. Wait for the result."
-            raise Problem("robot-type-checking", 409, "Still being checked", detail)
+            raise Problem("robot-type-checking", 409, "The last version is not validated", detail)
 
 
 async def require_own(catalogue: RobotCatalogue, robot_type: str) -> None:

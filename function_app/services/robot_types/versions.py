@@ -15,9 +15,9 @@ from function_app.services.storage import records as store
 
 GIVE_UP_MS = 120_000
 """Time after which an upload without a verdict is rejected."""
-KEEP_LOOK_MS = 30 * 60_000
+KEEP_PREVIEW_MS = 30 * 60_000
 """Time for which a preview can be saved."""
-_LOOK_S = 0.1
+_POLL_S = 0.1
 
 
 class TypeVersions:
@@ -37,13 +37,13 @@ class TypeVersions:
         for name, content in files.items():
             await self._blobs.put(where.prefix(version) + name, content)
         row, upload = await read_version(self._tables, where, version)
-        there = False
+        stored = False
         if row is not None and upload is not None and upload.state == "uploading":
             data = {**row.data, "state": "checking"}
             with contextlib.suppress(Conflict):
                 await self._tables.replace(store.ROBOT_TYPES, Row(row.partition, row.key, data, row.etag))
-                there = True
-        if not there:
+                stored = True
+        if not stored:
             # The version was rejected or the type deleted: the files are not needed.
             await drop_files(self._blobs, where, version)
             raise busy_store()
@@ -59,7 +59,7 @@ class TypeVersions:
             left_s = end_s - loop.time()
             if upload is None or not upload.open or left_s <= 0:
                 return upload
-            await asyncio.sleep(min(_LOOK_S, left_s))
+            await asyncio.sleep(min(_POLL_S, left_s))
 
 
 def refused(upload: TypeVersion) -> Problem:

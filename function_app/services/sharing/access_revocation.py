@@ -1,6 +1,6 @@
 """Revokes what an account did with permissions that it has lost.
 
-Lease, queued and running actions, and broker connections end at once. The device holds and starts no queued action.
+Lease, queued and running actions, and broker connections end. The device holds and starts no queued action.
 
 Users of a share write first and check the share again (``DeviceAccess.require_still_allowed``). This module runs after
 the share was deleted, so at least one of both sees the other. All steps are idempotent.
@@ -32,9 +32,9 @@ from function_app.services.identity.authenticator import all_viewers
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.storage import records
 
-TELL_S: Final = 1.5
+NOTIFY_S: Final = 1.5
 """Time limit for the broker when a caller waits [s]."""
-TELL_AGAIN_S: Final = 10.0
+RETRY_NOTIFY_S: Final = 10.0
 """Time limit for the broker when the timer retries [s]."""
 INDEX: Final = "share:"
 """Key prefix of shares in an account's partition of ``Members``."""
@@ -67,7 +67,7 @@ class AccessRevocation:
         self._clock = clock
 
     async def settle(self, share: Share, *, again: bool = False) -> bool:
-        """Revoke what the share's account may no longer do; return whether broker and devices were notified.
+        """Revoke permissions that the share's account has lost; return whether broker and devices were notified.
 
         Args:
             share: The deleted or reduced share. Permissions of other shares remain.
@@ -77,17 +77,17 @@ class AccessRevocation:
             Problem: ``busy``.
         """
         devices = await self._devices_on(share)
-        until_s = asyncio.get_running_loop().time() + (TELL_AGAIN_S if again else TELL_S)
+        until_s = asyncio.get_running_loop().time() + (RETRY_NOTIFY_S if again else NOTIFY_S)
         done = await asyncio.gather(
-            self._cut(share.account, until_s),
+            self._close_viewers(share.account, until_s),
             *(self._end_at(device, share.account, until_s, again=again) for device in devices),
         )
         if await self._tables.get(records.SHARES, share.on, share_key(share.account)) is None:
             await self._unindex(share)
         return all(done)
 
-    async def _cut(self, account: str, until_s: float) -> bool:
-        """Cut the account's viewing connections; it can view its other devices with new credentials."""
+    async def _close_viewers(self, account: str, until_s: float) -> bool:
+        """Close the account's viewing connections; new credentials cover its remaining devices."""
         try:
             async with asyncio.timeout_at(until_s):
                 await self._access.revoke(principal=all_viewers(account))

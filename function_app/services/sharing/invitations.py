@@ -27,9 +27,9 @@ from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import Retention
 
-LOOK_MS: Final = 10_000
+CHECK_MS: Final = 10_000
 """Delay after which the timer continues an accepted transfer."""
-_NOTE: Final = "transfer:"
+_REMINDER: Final = "transfer:"
 _INDEX: Final = "invitation:"
 
 
@@ -53,7 +53,7 @@ class Offer:
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class KnownInvitation:
     """An invitation and its id."""
 
     id: str
@@ -95,7 +95,7 @@ class Invitations:
             raise _last_space("It is this account's only space. Create another one first.")
         return target
 
-    async def make(self, caller: Identity, shared: Target, offer: Offer) -> tuple[str, Known]:
+    async def make(self, caller: Identity, shared: Target, offer: Offer) -> tuple[str, KnownInvitation]:
         """A new invitation and its secret, which cannot be read again.
 
         Raises:
@@ -123,7 +123,7 @@ class Invitations:
             account=offer.account,
         )
         secret = new_secret()
-        existing = Known(_hash(secret), created)
+        existing = KnownInvitation(_hash(secret), created)
         # Deletion is scheduled and the invitation is listed before it can be redeemed.
         await self._retention.delete_row_at(records.INVITATIONS, existing.id[0], existing.id, due_ms=created.expires_ms)
         await self._retention.delete_row_at(records.SHARES, created.on, _INDEX + existing.id, due_ms=created.expires_ms)
@@ -134,16 +134,16 @@ class Invitations:
         async with self._audit_log.change(
             created.owner, AccountEvent.INVITED, caller, on=created.on, **terms
         ) as change:
-            await change.noted()
+            await change.store_pending()
             await self._tables.create(records.INVITATIONS, Row(existing.id[0], existing.id, records.to_data(created)))
         return secret, existing
 
-    async def open(self, shared: Target) -> list[Known]:
+    async def open(self, shared: Target) -> list[KnownInvitation]:
         """Open invitations to a target, oldest first."""
         page = await self._tables.query(records.SHARES, shared.on, first=_INDEX, last="invitation;", limit=1000)
         listed = [await self._open(row.key.removeprefix(_INDEX)) for row in page.rows]
         result = [
-            Known(row.key, invitation)
+            KnownInvitation(row.key, invitation)
             for row, invitation in filter(None, listed)
             if (invitation.owner, invitation.pairing) == (shared.owner.id, shared.pairing)
         ]
@@ -160,7 +160,7 @@ class Invitations:
             existing = await self._open(invitation)
             if existing is None or existing[1].on != shared.on:
                 raise not_found("invitation", invitation)
-            await change.noted()
+            await change.store_pending()
             await self._tables.delete(records.INVITATIONS, existing[0])
 
         named = {"invitation": invitation[:12]}
@@ -170,7 +170,7 @@ class Invitations:
             await records.retry(attempt)
         await self._unlist(shared.on, invitation)
 
-    async def look(self, secret: str) -> Known:
+    async def look(self, secret: str) -> KnownInvitation:
         """The invitation with this secret.
 
         Raises:
@@ -178,18 +178,18 @@ class Invitations:
         """
         return await self.find(_hash(secret))
 
-    async def find(self, invitation: str) -> Known:
+    async def find(self, invitation: str) -> KnownInvitation:
         """The invitation with this id, for a caller who has presented the secret before.
 
         Raises:
             Problem: ``invitation-unknown``.
         """
         existing = await self._open(invitation)
-        if existing is None or not await self._good(existing[1]):
+        if existing is None or not await self._is_valid(existing[1]):
             raise _unknown()
-        return Known(invitation, existing[1])
+        return KnownInvitation(invitation, existing[1])
 
-    async def redeem(self, caller: Identity, existing: Known, *, space: str | None = None) -> None:
+    async def redeem(self, caller: Identity, existing: KnownInvitation, *, space: str | None = None) -> None:
         """Redeem an invitation, whose secret the caller has presented.
 
         ``space``: space of the caller for a transferred agent; ``None``: the first one.
@@ -206,52 +206,52 @@ class Invitations:
         if offered.owner == caller.account:
             raise own_share_error("This account is already the owner. Send the link to another person.")
         if offered.role is Role.OWNER:
-            await self._take(caller, existing, space)
+            await self._accept(caller, existing, space)
         else:
             await self._use(caller, existing)
             owner = Account(offered.owner, offered.by)
             shared = Target(offered.on, owner, offered.label, offered.pairing)
-            giver = Identity(offered.owner, offered.by, "")
+            inviter = Identity(offered.owner, offered.by, "")
             ends_ms = offered.ends_ms(self._clock.now_ms())
-            await self._sharing.give(giver, shared, Account(caller.account, caller.name), offered.role, ends_ms)
+            await self._sharing.give(inviter, shared, Account(caller.account, caller.name), offered.role, ends_ms)
 
-    async def go_on(self, what: str, note: Row) -> None:
+    async def resume_transfer(self, what: str, reminder: Row) -> None:
         """Called by the timer: continue an accepted transfer."""
-        invitation = what.removeprefix(_NOTE)
+        invitation = what.removeprefix(_REMINDER)
         row, existing = await self._get(invitation)
         if row is not None and existing is not None and existing.taken_by:
             await self._carry_out(invitation, existing)
-        await self._reminders.cancel(note)
+        await self._reminders.cancel(reminder)
 
-    async def _take(self, caller: Identity, existing: Known, space: str | None) -> None:
+    async def _accept(self, caller: Identity, existing: KnownInvitation, space: str | None) -> None:
         """Accept a transfer. The write on the invitation decides; then the timer also continues it."""
         kind, _ = split_target(existing.invitation.on)
-        goal = new_id(12)
+        target_space = new_id(12)
         if kind == "agent":
             own = await self._sign_in.spaces(caller.account)
-            chosen = next((each.id for each in own if space in {None, each.id}), None)
-            if chosen is None:
+            own_space = next((each.id for each in own if space in {None, each.id}), None)
+            if own_space is None:
                 raise not_found("space", space or "")
-            goal = chosen
+            target_space = own_space
         elif len(await self._sign_in.spaces(existing.invitation.owner)) == 1:
             # Another transfer may have made it the last space.
             raise _last_space(f"It is {existing.invitation.by}'s only space. The owner must create another one first.")
-        note = await self._reminders.schedule(f"{_NOTE}{existing.id}", self._clock.now_ms() + LOOK_MS)
+        reminder = await self._reminders.schedule(f"{_REMINDER}{existing.id}", self._clock.now_ms() + CHECK_MS)
 
         async def attempt() -> Invitation:
-            found = await self._open(existing.id)
-            if found is None:
+            current = await self._open(existing.id)
+            if current is None:
                 raise _unknown()
-            row, offered = found
-            taken = offered.accepted(caller.account, goal)
-            await given.noted()
-            await got.noted()
+            row, offered = current
+            taken = offered.accepted(caller.account, target_space)
+            await change.store_pending()
+            await got.store_pending()
             await records.update(self._tables, records.INVITATIONS, row, taken)
             return taken
 
         owner, on, to = existing.invitation.owner, existing.invitation.on, {"to": caller.account}
         async with (
-            self._audit_log.change(owner, AccountEvent.TRANSFERRED, caller, on=on, **to) as given,
+            self._audit_log.change(owner, AccountEvent.TRANSFERRED, caller, on=on, **to) as change,
             self._audit_log.change(caller.account, AccountEvent.TRANSFERRED, caller, on=on, **to) as got,
         ):
             taken = await records.retry(attempt)
@@ -260,8 +260,8 @@ class Invitations:
                 "It was transferred or unpaired after the invitation was created. Ask its owner for a new invitation."
             )
             raise Problem("transfer-impossible", 409, "It cannot be transferred", detail)
-        if note is not None:
-            await self._reminders.cancel(note)
+        if reminder is not None:
+            await self._reminders.cancel(reminder)
 
     async def _carry_out(self, invitation: str, taken: Invitation) -> bool:
         """Complete an accepted transfer and delete its invitation; False: the target has another owner."""
@@ -271,26 +271,26 @@ class Invitations:
         await self._unlist(taken.on, invitation)
         return done
 
-    async def _use(self, caller: Identity, existing: Known) -> None:
+    async def _use(self, caller: Identity, existing: KnownInvitation) -> None:
         """Count one use; fails if another account was first."""
 
         async def attempt() -> None:
-            found = await self._open(existing.id)
-            if found is None or caller.account in found[1].takers:
+            current = await self._open(existing.id)
+            if current is None or caller.account in current[1].takers:
                 raise _unknown()
-            row, left = found[0], found[1].redeemed(caller.account)
-            await change.noted()
-            if left.uses:
-                await records.update(self._tables, records.INVITATIONS, row, left)
+            row, remaining = current[0], current[1].redeemed(caller.account)
+            await change.store_pending()
+            if remaining.uses:
+                await records.update(self._tables, records.INVITATIONS, row, remaining)
             else:
                 await self._tables.delete(records.INVITATIONS, row)
-                await self._unlist(left.on, existing.id)
+                await self._unlist(remaining.on, existing.id)
 
         owner, on, terms = existing.invitation.owner, existing.invitation.on, {"invitation": existing.id[:12]}
         async with self._audit_log.change(owner, AccountEvent.INVITATION_REDEEMED, caller, on=on, **terms) as change:
             await records.retry(attempt)
 
-    async def _good(self, existing: Invitation) -> bool:
+    async def _is_valid(self, existing: Invitation) -> bool:
         """Whether the target still belongs to the inviting account."""
         kind, name = split_target(existing.on)
         if kind == "space":
@@ -314,9 +314,9 @@ class Invitations:
         await records.remove(self._tables, records.SHARES, on, _INDEX + invitation)
 
 
-def about_transfer(note: str) -> bool:
+def about_transfer(reminder: str) -> bool:
     """Whether a reminder is about a transfer."""
-    return note.startswith(_NOTE)
+    return reminder.startswith(_REMINDER)
 
 
 def _last_space(detail: str) -> Problem:

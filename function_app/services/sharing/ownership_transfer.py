@@ -41,33 +41,35 @@ class OwnershipTransfer:
         self._offboarding = offboarding
         self._clock = clock
 
-    async def carry_out(self, taken: Invitation) -> bool:
+    async def carry_out(self, invitation: Invitation) -> bool:
         """Execute the remaining steps; return False if the agent has another owner than the offering account.
 
         Raises:
             Problem: ``busy``.
         """
-        kind, name = split_target(taken.on)
+        kind, name = split_target(invitation.on)
         if kind == "agent":
-            return await self._hand_over(name, taken, pairing=taken.pairing)
-        await self._carry_space(name, taken)
+            return await self._transfer_agent(name, invitation, pairing=invitation.pairing)
+        await self._transfer_space(name, invitation)
         return True
 
-    async def _carry_space(self, name: str, taken: Invitation) -> None:
+    async def _transfer_space(self, name: str, invitation: Invitation) -> None:
         """Create the new space, close the former one, then move its agents."""
         row = Row(
-            taken.taken_by,
-            f"space:{taken.taken_space}",
-            records.to_data(Space(taken.taken_space, taken.label, self._clock.now_ms())),
+            invitation.taken_by,
+            f"space:{invitation.taken_space}",
+            records.to_data(Space(invitation.taken_space, invitation.label, self._clock.now_ms())),
         )
         with contextlib.suppress(Conflict):
             await self._tables.create(records.ACCOUNTS, row)
-        await records.remove(self._tables, records.ACCOUNTS, taken.owner, f"space:{name}")
-        for agent in sorted({device.agent for device in await self._devices.in_space(taken.owner, name)}):
-            await self._hand_over(agent, taken, space=name)
+        await records.remove(self._tables, records.ACCOUNTS, invitation.owner, f"space:{name}")
+        for agent in sorted({device.agent for device in await self._devices.in_space(invitation.owner, name)}):
+            await self._transfer_agent(agent, invitation, space=name)
         await self._sharing.end_all(space_target(name))
 
-    async def _hand_over(self, agent_id: str, taken: Invitation, *, pairing: str = "", space: str = "") -> bool:
+    async def _transfer_agent(
+        self, agent_id: str, invitation: Invitation, *, pairing: str = "", space: str = ""
+    ) -> bool:
         """Transfer an agent of this pairing or space; return whether the new owner has it."""
         await self._offboarding.watch(agent_id)
 
@@ -75,16 +77,16 @@ class OwnershipTransfer:
             row, agent = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
             if row is None or agent is None:
                 return None
-            offered = (taken.owner, pairing or agent.pairing, space or agent.space)
+            offered = (invitation.owner, pairing or agent.pairing, space or agent.space)
             if (agent.account, agent.pairing, agent.space) != offered:
                 return agent
             now_ms = self._clock.now_ms()
             changed = rules.transfer(
-                agent, account=taken.taken_by, space=taken.taken_space, pairing=new_id(), now_ms=now_ms
+                agent, account=invitation.taken_by, space=invitation.taken_space, pairing=new_id(), now_ms=now_ms
             )
             member = _Member(changed.pairing)
             await records.upsert(
-                self._tables, records.MEMBERS, taken.taken_by, f"agent:{agent_id}", lambda _: member, _Member
+                self._tables, records.MEMBERS, invitation.taken_by, f"agent:{agent_id}", lambda _: member, _Member
             )
             await self._tables.replace(records.AGENTS, Row(agent_id, "agent", records.to_data(changed), row.etag))
             return changed
@@ -92,4 +94,4 @@ class OwnershipTransfer:
         agent = await records.retry(attempt)
         if agent is not None and agent.leaving:
             await self._offboarding.finish(agent_id)
-        return agent is not None and agent.account == taken.taken_by
+        return agent is not None and agent.account == invitation.taken_by

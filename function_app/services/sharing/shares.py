@@ -1,7 +1,7 @@
 """Shares of devices and spaces with other accounts.
 
-A write or deletion of the share's row takes effect at once. ``AccessRevocation`` ends what depended on a lost role; a
-reminder, written first, continues this if the process is killed.
+A write or deletion of the share's row takes effect immediately. ``AccessRevocation`` ends leases, actions and
+connections of a lost role. A reminder, written first, continues this if the process is killed.
 """
 
 import asyncio
@@ -37,9 +37,9 @@ from function_app.services.sharing.access_revocation import AccessRevocation, in
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 
-LOOK_MS: Final = 10_000
+CHECK_MS: Final = 10_000
 """Delay after which the timer continues an interrupted change."""
-AGAIN_MS: Final = 1_000
+RETRY_MS: Final = 1_000
 """Interval of retries while the broker is not reachable."""
 _CHANGED: Final = "share-changed:"
 _EXPIRES: Final = "share-expires:"
@@ -112,7 +112,7 @@ class Sharing:
         """Current shares of a target, with account names."""
         page = await self._tables.query(records.SHARES, shared.on, first="account:", last="account;", limit=1000)
         now_ms = self._clock.now_ms()
-        result = [share for row in page.rows if _holds(share := records.read(row, Share), shared, now_ms)]
+        result = [share for row in page.rows if _is_valid(share := records.read(row, Share), shared, now_ms)]
         names = await asyncio.gather(*(self._sign_in.named(share.account) for share in result))
         return sorted(zip(result, names, strict=True), key=lambda each: each[0].created_ms)
 
@@ -130,12 +130,12 @@ class Sharing:
         """
         expires_ms = expiry_ms(for_s, self._clock.now_ms())
         share = self._share(shared, account.id, require_shareable(role), caller.name, expires_ms)
-        return await self._write(caller, shared, account, share, keep_more=False)
+        return await self._write(caller, shared, account, share, extend_only=False)
 
     async def give(self, caller: Identity, shared: Target, account: Account, role: Role, expires_ms: int) -> Share:
         """Create or extend a share by invitation; never reduces an existing one."""
         share = self._share(shared, account.id, role, caller.name, expires_ms)
-        return (await self._write(caller, shared, account, share, keep_more=True))[0]
+        return (await self._write(caller, shared, account, share, extend_only=True))[0]
 
     async def end(self, caller: Identity, shared: Target, account: str) -> bool:
         """End a share; return whether broker and devices were notified. If not, the timer retries.
@@ -144,7 +144,7 @@ class Sharing:
             Problem: ``share-unknown``, ``busy``.
         """
         row = await self._tables.get(records.SHARES, shared.on, share_key(account))
-        if row is None or not _holds(records.read(row, Share), shared, self._clock.now_ms()):
+        if row is None or not _is_valid(records.read(row, Share), shared, self._clock.now_ms()):
             raise not_found("share", account)
         return await self._end(caller, row)
 
@@ -180,7 +180,7 @@ class Sharing:
         """
         result = await self._sign_in.known(name)
         if result is None:
-            detail = f"There is no account '{name[:80]}'. Ask for the exact sign-in name, or create an invitation."
+            detail = f"There is no account '{name[:80]}'. Check the exact sign-in name, or create an invitation."
             raise Problem("account-unknown", 404, "No such account", detail)
         return result
 
@@ -206,25 +206,25 @@ class Sharing:
         )
 
     async def _write(
-        self, caller: Identity, shared: Target, account: Account, share: Share, *, keep_more: bool
+        self, caller: Identity, shared: Target, account: Account, share: Share, *, extend_only: bool
     ) -> tuple[Share, bool, bool]:
-        note = await self._reminders.schedule(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
+        reminder = await self._reminders.schedule(_reminder(_CHANGED, share), self._clock.now_ms() + CHECK_MS)
         if share.expires_ms < NEVER_MS:
-            await self._reminders.schedule(_note(_EXPIRES, share), share.expires_ms)
+            await self._reminders.schedule(_reminder(_EXPIRES, share), share.expires_ms)
         # Written first: without the share's row the index entry has no effect.
         await index(self._tables, share)
-        lowered = False
+        reduced = False
 
         async def attempt() -> tuple[Share, bool]:
-            nonlocal lowered
+            nonlocal reduced
             row, existing = await records.find(self._tables, records.SHARES, share.on, share_key(share.account), Share)
-            before = existing if existing is not None and _holds(existing, shared, self._clock.now_ms()) else None
-            if before is not None and keep_more and not _more(share, before):
+            before = existing if existing is not None and _is_valid(existing, shared, self._clock.now_ms()) else None
+            if before is not None and extend_only and not _extends(share, before):
                 return before, False
-            lowered = before is not None and (outranks(before.role, share.role) or share.expires_ms < before.expires_ms)
+            reduced = before is not None and (outranks(before.role, share.role) or share.expires_ms < before.expires_ms)
             if row is None:
                 await self._check_room(share.on)
-            await change.noted()
+            await change.store_pending()
             if row is None:
                 await self._tables.create(
                     records.SHARES, Row(share.on, share_key(share.account), records.to_data(share))
@@ -238,30 +238,32 @@ class Sharing:
             written, created = await records.retry(attempt)
         if written is share:
             message = f"{caller.name} shared it with {account.name} as {share.role}."
-            await self._tell(share, Fact.SHARED, message, by=caller.name, account=account.id, role=share.role.value)
-        return written, created, not lowered or await self._settle(share, note)
+            await self._add_event(
+                share, Fact.SHARED, message, by=caller.name, account=account.id, role=share.role.value
+            )
+        return written, created, not reduced or await self._settle(share, reminder)
 
     async def _check_room(self, on: str) -> None:
         page = await self._tables.query(records.SHARES, on, first="account:", last="account;", limit=MAX_SHARES)
         now_ms = self._clock.now_ms()
-        dead = [row for row in page.rows if not records.read(row, Share).is_live(now_ms)]
-        if len(page.rows) - len(dead) >= MAX_SHARES:
+        expired = [row for row in page.rows if not records.read(row, Share).is_live(now_ms)]
+        if len(page.rows) - len(expired) >= MAX_SHARES:
             detail = f"It is already shared with {MAX_SHARES} accounts. End one of these shares."
             raise Problem("too-many-shares", 409, "Too many shares", detail)
 
     async def _end(self, caller: Identity | None, row: Row) -> bool:
         """Delete the share's row and revoke the permissions; return whether broker and devices were notified."""
         share = records.read(row, Share)
-        note = await self._reminders.schedule(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
+        reminder = await self._reminders.schedule(_reminder(_CHANGED, share), self._clock.now_ms() + CHECK_MS)
         name = await self._sign_in.named(share.account)
         on = {"on": share.on, "with": share.account, "name": name}
         async with self._audit_log.change(share.owner, AccountEvent.UNSHARED, caller, **on) as change:
-            await change.noted()
+            await change.store_pending()
             try:
                 await self._tables.delete(records.SHARES, row)
             except Conflict:
-                change.came_to_nothing = True
-        if change.came_to_nothing:
+                change.discarded = True
+        if change.discarded:
             created = await self._tables.get(records.SHARES, row.partition, row.key)
             # A share that expired and was renewed concurrently remains.
             if created is not None and (
@@ -269,30 +271,30 @@ class Sharing:
             ):
                 return await self._end(caller, created)
             return True
-        done = await self._settle(share, note)
+        done = await self._settle(share, reminder)
         if caller is None:
-            await self._tell(share, Fact.UNSHARED, f"The share of {name} expired.", account=share.account)
+            await self._add_event(share, Fact.UNSHARED, f"The share of {name} expired.", account=share.account)
         else:
             message = f"{caller.name} ended the share of {name}."
-            await self._tell(share, Fact.UNSHARED, message, by=caller.name, account=share.account)
+            await self._add_event(share, Fact.UNSHARED, message, by=caller.name, account=share.account)
         return done
 
-    async def _settle(self, share: Share, note: Row | None) -> bool:
+    async def _settle(self, share: Share, reminder: Row | None) -> bool:
         """Revoke what exceeds the remaining role; the timer retries failed notifications."""
         done = await self._access_revocation.settle(share)
         if not done:
-            await self._reminders.schedule(_note(_CHANGED, share), self._clock.now_ms() + AGAIN_MS)
-        if note is not None:
-            await self._reminders.cancel(note)
+            await self._reminders.schedule(_reminder(_CHANGED, share), self._clock.now_ms() + RETRY_MS)
+        if reminder is not None:
+            await self._reminders.cancel(reminder)
         return done
 
-    async def _tell(self, share: Share, fact: Fact, message: str, **data: str) -> None:
+    async def _add_event(self, share: Share, fact: Fact, message: str, **data: str) -> None:
         kind, name = split_target(share.on)
         device = await self._devices.get_as_owner(name) if kind == "device" else None
         if device is not None and device.pairing == share.pairing:
             await self._control_events.add_event(device, fact, message, data=data)
 
-    async def look(self, what: str, note: Row) -> None:
+    async def check_reminder(self, what: str, reminder: Row) -> None:
         """Called by the timer for a changed or expiring share."""
         expired = what.startswith(_EXPIRES)
         on, _, account = what.removeprefix(_EXPIRES if expired else _CHANGED).rpartition("|")
@@ -300,10 +302,10 @@ class Sharing:
         if row is not None and share is not None and not share.is_live(self._clock.now_ms()):
             await self._end(None, row)
         elif not expired:
-            kept = share or Share(on, account, Role.VIEWER, "", "", 0)
-            if not await self._access_revocation.settle(kept, again=True):
-                await self._reminders.schedule(what, self._clock.now_ms() + AGAIN_MS)
-        await self._reminders.cancel(note)
+            revoked = share or Share(on, account, Role.VIEWER, "", "", 0)
+            if not await self._access_revocation.settle(revoked, again=True):
+                await self._reminders.schedule(what, self._clock.now_ms() + RETRY_MS)
+        await self._reminders.cancel(reminder)
 
 
 def require_person(caller: Identity) -> None:
@@ -313,28 +315,28 @@ def require_person(caller: Identity) -> None:
         Problem: ``forbidden``.
     """
     if caller.key:
-        raise forbidden("An API key cannot share, transfer or accept anything. Sign in for that.")
+        raise forbidden("An API key cannot share, transfer or accept. Sign in instead.")
 
 
 def own_share_error(detail: str) -> Problem:
     """The error for operations that the owner cannot apply to an own target."""
-    return Problem("already-owner", 409, "It is yours", detail)
+    return Problem("already-owner", 409, "Not possible for the owner", detail)
 
 
-def about_share(note: str) -> bool:
+def about_share(reminder: str) -> bool:
     """Whether a reminder is about a share."""
-    return note.startswith((_CHANGED, _EXPIRES))
+    return reminder.startswith((_CHANGED, _EXPIRES))
 
 
-def _note(kind: str, share: Share) -> str:
+def _reminder(kind: str, share: Share) -> str:
     return f"{kind}{share.on}|{share.account}"
 
 
-def _holds(share: Share, shared: Target, now_ms: int) -> bool:
+def _is_valid(share: Share, shared: Target, now_ms: int) -> bool:
     return share.is_live(now_ms) and share.owner == shared.owner.id and share.pairing == shared.pairing
 
 
-def _more(share: Share, than: Share) -> bool:
+def _extends(share: Share, than: Share) -> bool:
     if share.role is than.role:
         return share.expires_ms > than.expires_ms
     return outranks(share.role, than.role)

@@ -27,20 +27,20 @@ from function_app.services.storage import records
 from function_app.services.telemetry.series_writer import Place, SeriesWriter
 
 SHARDS = 8
-KNOWN_MS = 3_000
+CACHE_MS = 3_000
 """Cache time of an agent's row. For this time data of an unpaired agent are stored in its former pairing."""
-MAX_KNOWN = 1_000
-LEFT_MS = 30_000
+MAX_CACHED = 1_000
+BACKLOG_MS = 30_000
 """Rows older than this were left by a terminated process."""
-GIVE_UP_MS = 3_600_000
+DROP_MS = 3_600_000
 """Rows that could not be distributed for this time are dropped."""
 MAX_ROW_BYTES = 200_000
 """Approximate maximum size of a queue row [bytes]."""
 _BYTES_PER_VALUE = 11
 """Eight incompressible bytes in base64."""
 _JOINT = re.compile(r"\A[A-Za-z0-9_-]{1,60}\Z")
-_LEFT = 20
-_AT_ONCE = 20
+_BACKLOG_ROWS = 20
+_YIELD_EVERY = 20
 """Messages processed before the event loop runs other tasks: telemetry must not delay acks."""
 
 Values = Mapping[str, float]
@@ -94,7 +94,7 @@ class TelemetryIngest:
         parts: dict[tuple[str, str], list[tuple[int, Values]]] = defaultdict(list)
         devices: dict[str, Device] = {}
         for number, message in enumerate(messages):
-            if number % _AT_ONCE == 0:
+            if number % _YIELD_EVERY == 0:
                 await asyncio.sleep(0)
             existing = await self._agent(message.topic.agent)
             device = existing.devices.get(message.topic.device)
@@ -122,13 +122,13 @@ class TelemetryIngest:
         self._turn += 1
         now_ms = self._clock.now_ms()
         shard = str(self._turn % SHARDS)
-        page = await self._tables.query(records.DATA, shard, last=f"{now_ms - LEFT_MS:013d}", limit=_LEFT)
+        page = await self._tables.query(records.DATA, shard, last=f"{now_ms - BACKLOG_MS:013d}", limit=_BACKLOG_ROWS)
         for row in page.rows:
             try:
                 await self._distribute(row, await self._parts(row))
             except Problem as problem:
                 _log.warning("data of %s: %s", row.key, problem.detail)
-                if now_ms - int(row.key.partition(":")[0]) > GIVE_UP_MS:
+                if now_ms - int(row.key.partition(":")[0]) > DROP_MS:
                     await self._drop(row)
 
     async def _queue(self, batch: Sequence["_Part"]) -> Row:
@@ -147,7 +147,7 @@ class TelemetryIngest:
             await asyncio.sleep(0)
             new = await self._writer.add(Place(device.id, device.pairing, stream), samples)
             if new:
-                await self._tell(device, stream, new)
+                await self._notify_observers(device, stream, new)
         await self._drop(row)
 
     async def _parts(self, row: Row) -> list["_Part"]:
@@ -161,7 +161,7 @@ class TelemetryIngest:
                 parts.append(_Part(device, part["stream"], series.unpack(part["samples"])))
         return parts
 
-    async def _tell(self, device: Device, stream: str, new: Samples) -> None:
+    async def _notify_observers(self, device: Device, stream: str, new: Samples) -> None:
         means = []
         for _, window in new.windows():
             fields = series.summarize(window).fields
@@ -169,21 +169,21 @@ class TelemetryIngest:
         for observer in self._observers:
             try:
                 await observer(device, stream, means)
-            except Exception:  # noqa: BLE001 (who only watches must not hold up what is watched)
+            except Exception:  # noqa: BLE001 (an observer must not block the ingest)
                 _log.exception("observer of %s of %s", stream, device.id)
 
     async def _drop(self, row: Row) -> None:
         try:
             await self._tables.delete(records.DATA, row)
         except Conflict:
-            _log.debug("%s was distributed twice, and counted once", row.key)
+            _log.debug("%s was distributed twice and stored once", row.key)
 
     async def _agent(self, agent_id: str) -> _Agent:
         now_ms = self._clock.now_ms()
         existing = self._agents.get(agent_id)
-        if existing is not None and 0 <= now_ms - existing.read_ms < KNOWN_MS:
+        if existing is not None and 0 <= now_ms - existing.read_ms < CACHE_MS:
             return existing
-        if len(self._agents) >= MAX_KNOWN:
+        if len(self._agents) >= MAX_CACHED:
             self._agents.clear()
         row = await self._tables.get(records.AGENTS, agent_id, "agent") if agent_id else None
         agent = None if row is None else records.read(row, Agent)
@@ -208,18 +208,18 @@ class _Part(NamedTuple):
 def _batches(parts: Iterable[_Part]) -> Iterator[list[_Part]]:
     """Groups of parts that fit into one queue row."""
     batch: list[_Part] = []
-    left = MAX_ROW_BYTES
+    free = MAX_ROW_BYTES
     for device, stream, samples in parts:
         fields = len(samples.columns)
         step = max(1, MAX_ROW_BYTES * 3 // 4 // (_BYTES_PER_VALUE * (fields + 2)))
         for begin in range(0, len(samples), step):
             piece = samples.part(begin, begin + step)
             size = _BYTES_PER_VALUE * len(piece) * (fields + 2) + sum(len(name) + 4 for name in samples.columns) + 400
-            if batch and size > left:
+            if batch and size > free:
                 yield batch
-                batch, left = [], MAX_ROW_BYTES
+                batch, free = [], MAX_ROW_BYTES
             batch.append(_Part(device, stream, piece))
-            left -= size
+            free -= size
     if batch:
         yield batch
 

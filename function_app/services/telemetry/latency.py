@@ -97,30 +97,30 @@ class LatencyStore:
         self._retention = retention
         self._clock = clock
 
-    async def add(self, device: Device, given: Samples, *, caller: str, once: str = "") -> None:
-        """Add samples. Idempotent by ``once``, the idempotency key of the batch, or by equality of the samples.
+    async def add(self, device: Device, batch: Samples, *, caller: str, idempotency_key: str = "") -> None:
+        """Add samples. Idempotent by ``idempotency_key``, or by equality of the samples.
 
         Raises:
             Problem: ``invalid``: an impossible time; ``idempotency-key-reused``; ``busy``.
         """
-        self._check(given)
-        fingerprint = given.fingerprint()
-        name = once or fingerprint
-        day = max(at_ms for at_ms, _ in given.samples) // DAY_MS
+        self._check(batch)
+        fingerprint = batch.fingerprint()
+        name = idempotency_key or fingerprint
+        day = max(at_ms for at_ms, _ in batch.samples) // DAY_MS
         mark = _mark(day) + hashlib.sha256(f"{caller}\n{name}".encode()).hexdigest()
         hours: dict[int, list[tuple[int, float]]] = {}
-        for sample in given.samples:
+        for sample in batch.samples:
             hours.setdefault(sample[0] // HOUR_MS, []).append(sample)
         starts = sorted(hours)
         for number, first in enumerate(range(0, len(starts), _HOURS_A_BATCH)):
             part = [sample for hour in starts[first : first + _HOURS_A_BATCH] for sample in hours[hour]]
-            parts = {f"{given.transport}:{given.path}": part}
+            parts = {f"{batch.transport}:{batch.path}": part}
             place = _partition(device.id, device.pairing)
             await records.retry(partial(self._count, place, f"{mark}:{number}", fingerprint, parts))
 
     async def measured(self, action: Action, transport: Transport) -> None:
-        """Add the latencies of an ended action, once, in the background."""
-        samples = _times(action)
+        """Add the latencies of an ended action in the background. Idempotent."""
+        samples = _latencies(action)
         if not samples:
             return
         parts = {f"{transport}:{path}": [sample] for path, sample in samples.items()}
@@ -138,15 +138,15 @@ class LatencyStore:
         partition = _partition(device.id, device.pairing)
         first, last = "recent:", "recent;"
         page = await self._tables.query(records.LATENCY, partition, first=first, last=last, limit=1000)
-        wanted = []
+        stored = []
         for row in page.rows:
             _, of_transport, of_path = row.key.split(":")
             if transport in {None, of_transport} and path in {None, of_path}:
-                wanted.append((of_transport, of_path, records.read(row, _Recent).samples))
-        sums = await asyncio.gather(*(self._sum(partition, f"{one}:{other}", span) for one, other, _ in wanted))
+                stored.append((of_transport, of_path, records.read(row, _Recent).samples))
+        sums = await asyncio.gather(*(self._sum(partition, f"{one}:{other}", span) for one, other, _ in stored))
         return [
             LatencySeries(cast("Transport", of_transport), cast("Path", of_path), total, recent)
-            for (of_transport, of_path, recent), total in zip(wanted, sums, strict=True)
+            for (of_transport, of_path, recent), total in zip(stored, sums, strict=True)
         ]
 
     def span(self, first_ms: int | None, last_ms: int | None) -> Span:
@@ -164,9 +164,9 @@ class LatencyStore:
         step_ms = HOUR_MS if until_ms - since_ms <= BY_HOUR_MS else DAY_MS
         return Span(since_ms // step_ms * step_ms, -(-until_ms // step_ms) * step_ms, step_ms)
 
-    def _check(self, given: Samples) -> None:
+    def _check(self, batch: Samples) -> None:
         now_ms = self._clock.now_ms()
-        for at_ms, ms in given.samples:
+        for at_ms, ms in batch.samples:
             if not now_ms - OLDEST_MS <= at_ms <= now_ms + NEWEST_MS:
                 detail = f"at_ms {at_ms} is more than 7 days old or more than an hour ahead. Set the sender's clock."
                 raise invalid(detail)
@@ -193,17 +193,17 @@ class LatencyStore:
         writes = [Write("create", Row(partition, mark, {"fingerprint": fingerprint}))]
         for key, part in newest.items():
             row = rows.get(key)
-            kept = sorted([*(records.read(row, _Recent).samples if row else ()), *part])[-RECENT:]
-            writes.append(_write(partition, key, _Recent(tuple(kept)), row))
+            recent = sorted([*(records.read(row, _Recent).samples if row else ()), *part])[-RECENT:]
+            writes.append(_write(partition, key, _Recent(tuple(recent)), row))
         for group, times_ms in groups.items():
             row = rows.get(_key(*group))
             if row is None and group[0] == "day":
-                await self._keep_for_a_while(partition, *group[1:])
+                await self._schedule_deletion(partition, *group[1:])
             total = histogram.merge([histogram.of(times_ms), records.read(row, Histogram) if row else Histogram()])
             writes.append(_write(partition, _key(*group), total, row))
         await self._tables.batch(records.LATENCY, writes)
 
-    async def _keep_for_a_while(self, partition: str, kind: str, day_ms: int) -> None:
+    async def _schedule_deletion(self, partition: str, kind: str, day_ms: int) -> None:
         """Schedule the deletion of a new day's hours and markers, before they are written."""
         end_ms = day_ms + DAY_MS
         first, last = _key("hour", kind, day_ms), _key("hour", kind, end_ms)
@@ -211,7 +211,7 @@ class LatencyStore:
             records.LATENCY, partition, first=first, last=last, due_ms=end_ms + KEEP_HOURS_MS
         )
         first, last = _mark(day_ms // DAY_MS), _mark(end_ms // DAY_MS)
-        # After this time its samples are too old to be accepted again.
+        # After this time, samples of this day are rejected as too old.
         due_ms = end_ms + OLDEST_MS + DAY_MS
         await self._retention.delete_rows_at(records.LATENCY, partition, first=first, last=last, due_ms=due_ms)
 
@@ -239,7 +239,7 @@ def _key(step: str, kind: str, at_ms: int) -> str:
     return f"{step}:{kind}:{at_ms:014d}"
 
 
-def _times(action: Action) -> dict[str, tuple[int, float]]:
+def _latencies(action: Action) -> dict[str, tuple[int, float]]:
     """Latencies of an action, as differences of one clock each. Negative differences are skipped."""
     result: dict[str, tuple[int, float]] = {}
     published_ms = action.times.get("published")

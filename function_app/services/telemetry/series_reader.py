@@ -69,7 +69,7 @@ class Part:
     cursor: str | None = None
 
 
-class _Question(NamedTuple):
+class _Query(NamedTuple):
     """A range with all defaults resolved."""
 
     place: Place
@@ -107,7 +107,7 @@ class SeriesReader:
         views = await asyncio.gather(*(self._about(place._replace(stream=row.key)) for row in listed.rows))
         return [StreamView(row.key, about) for row, about in zip(listed.rows, views, strict=True) if about is not None]
 
-    async def read(self, caller: Identity, device: str, stream: str, wanted: Range) -> Part:
+    async def read(self, caller: Identity, device: str, stream: str, range_: Range) -> Part:
         """A page of one stream.
 
         Raises:
@@ -118,42 +118,42 @@ class SeriesReader:
         about = await self._about(place)
         if about is None:
             raise not_found("stream", stream)
-        level = None if wanted.level is None else _level(wanted.level)
-        first_ms = max(wanted.first_ms or 0, about.first_ms)
+        level = None if range_.level is None else _level(range_.level)
+        first_ms = max(range_.first_ms or 0, about.first_ms)
         last_ms = about.last_ms + 1
-        if wanted.last_ms is not None:
-            last_ms = min(wanted.last_ms, last_ms)
-        if wanted.cursor is not None:
-            level, first_ms = _read_cursor(wanted.cursor)
+        if range_.last_ms is not None:
+            last_ms = min(range_.last_ms, last_ms)
+        if range_.cursor is not None:
+            level, first_ms = _read_cursor(range_.cursor)
         if first_ms >= last_ms:
             return Part(level or FINEST, first_ms, max(first_ms, last_ms))
-        asked = _Question(place, first_ms, last_ms, wanted.points, _wanted(wanted.fields, about))
+        query = _Query(place, first_ms, last_ms, range_.points, _field_names(range_.fields, about))
         if level == RAW:
-            return await self._raw(asked)
+            return await self._raw(query)
         if level is not None:
-            part, _ = await self._buckets(level, asked)
+            part, _ = await self._buckets(level, query)
             return part
         now_ms = self._clock.now_ms()
-        level = series.finest_level(first_ms, last_ms, points=wanted.points, now_ms=now_ms, keep=self._keep)
-        part, samples = await self._buckets(level, asked)
-        if level == FINEST and samples <= wanted.points and first_ms > now_ms - self._keep.raw_ms:
-            return await self._raw(asked)
+        level = series.finest_level(first_ms, last_ms, points=range_.points, now_ms=now_ms, keep=self._keep)
+        part, samples = await self._buckets(level, query)
+        if level == FINEST and samples <= range_.points and first_ms > now_ms - self._keep.raw_ms:
+            return await self._raw(query)
         return part
 
     async def _about(self, place: Place) -> StreamInfo | None:
         row = await self._tables.get(records.SERIES, place.partition, ABOUT) if topics.is_id(place.stream) else None
         return None if row is None else records.read(row, StreamInfo)
 
-    async def _buckets(self, level: Level, asked: _Question) -> tuple[Part, int]:
+    async def _buckets(self, level: Level, query: _Query) -> tuple[Part, int]:
         """A page of buckets, and their number of samples."""
         page = await self._tables.query(
             records.SERIES,
-            asked.place.partition,
-            first=series.key(level, series.floor(asked.first_ms, level.span_ms)),
-            last=series.key(level, asked.last_ms),
-            limit=asked.points,
+            query.place.partition,
+            first=series.key(level, series.floor(query.first_ms, level.span_ms)),
+            last=series.key(level, query.last_ms),
+            limit=query.points,
         )
-        part = Part(level, asked.first_ms, asked.last_ms, summaries={name: [] for name in asked.names})
+        part = Part(level, query.first_ms, query.last_ms, summaries={name: [] for name in query.names})
         samples = 0
         for row in page.rows:
             bucket = series.bucket(row.data)
@@ -165,26 +165,26 @@ class SeriesReader:
             part.cursor = _write_cursor(level, part.at_ms[-1] + level.span_ms)
         return part, samples
 
-    async def _raw(self, asked: _Question) -> Part:
+    async def _raw(self, query: _Query) -> Part:
         """A page of raw samples."""
-        part = Part(RAW, asked.first_ms, asked.last_ms, values={name: [] for name in asked.names})
-        begin_ms = series.floor(asked.first_ms, WINDOW_MS)
-        rows = min(RAW_ROWS, asked.points)
+        part = Part(RAW, query.first_ms, query.last_ms, values={name: [] for name in query.names})
+        begin_ms = series.floor(query.first_ms, WINDOW_MS)
+        rows = min(RAW_ROWS, query.points)
         for _ in range(RAW_QUERIES):
             page = await self._tables.query(
                 records.SERIES,
-                asked.place.partition,
+                query.place.partition,
                 first=series.key(RAW, begin_ms),
-                last=series.key(RAW, asked.last_ms),
+                last=series.key(RAW, query.last_ms),
                 limit=rows,
             )
             for row in page.rows:
-                inside = series.unpack(row.data).between(asked.first_ms, asked.last_ms)
-                left = asked.points - len(part.at_ms)
-                if len(inside) > left:
-                    part.cursor = _write_cursor(RAW, inside.at_ms[left])
-                    inside = inside.part(0, left)
-                _extend(part, inside)
+                samples_ = series.unpack(row.data).between(query.first_ms, query.last_ms)
+                left = query.points - len(part.at_ms)
+                if len(samples_) > left:
+                    part.cursor = _write_cursor(RAW, samples_.at_ms[left])
+                    samples_ = samples_.part(0, left)
+                _extend(part, samples_)
                 if part.cursor is not None:
                     return part
             if page.cursor is None:
@@ -204,13 +204,13 @@ def _extend(part: Part, samples: Samples) -> None:
             values.extend(None if math.isnan(value) else value for value in column)
 
 
-def _wanted(fields: Sequence[str] | None, about: StreamInfo) -> Sequence[str]:
+def _field_names(fields: Sequence[str] | None, about: StreamInfo) -> Sequence[str]:
     if fields is None:
         return about.fields
     unknown = [name for name in fields if name not in about.fields]
     if unknown:
-        there = ", ".join(about.fields[:20])
-        raise invalid(f"The stream has no field '{unknown[0][:80]}'. It has: {there}.", code="field-unknown")
+        available = ", ".join(about.fields[:20])
+        raise invalid(f"The stream has no field '{unknown[0][:80]}'. It has: {available}.", code="field-unknown")
     return list(dict.fromkeys(fields))
 
 

@@ -25,7 +25,7 @@ AHEAD_MS = 300_000
 """Tolerated lead of a device clock; later samples are rejected."""
 MARGIN_MS = 3_600_000
 """Additional time that rows remain, for slow writers and clock differences."""
-MAX_WRITTEN = 100
+MAX_CACHED = 100
 """Streams whose newest rows are cached."""
 _MAX_BYTES = MAX_BATCH_BYTES * 3 // 4
 """Maximum size of a batch [bytes], with a reserve for metadata."""
@@ -64,7 +64,7 @@ class StreamInfo:
 
 
 @dataclass(slots=True)
-class _Known:
+class _CachedRows:
     """Rows of one stream as read."""
 
     about: Row | None
@@ -91,7 +91,7 @@ class SeriesWriter:
         self._retention = retention
         self._keep = keep
         self._clock = clock
-        self._written: dict[str, _Known] = {}
+        self._written: dict[str, _CachedRows] = {}
 
     async def add(self, place: Place, samples: Samples) -> Samples:
         """Add new samples; return those that were new.
@@ -104,11 +104,11 @@ class SeriesWriter:
             StoreError: As above.
         """
         now_ms = self._clock.now_ms()
-        taken = samples.between(now_ms - self._keep.raw_ms, now_ms + AHEAD_MS)
-        if len(taken) < len(samples):
-            _log.warning("%s: %d samples are too old or ahead of time", place, len(samples) - len(taken))
+        accepted = samples.between(now_ms - self._keep.raw_ms, now_ms + AHEAD_MS)
+        if len(accepted) < len(samples):
+            _log.warning("%s: %d samples are too old or ahead of time", place, len(samples) - len(accepted))
         new = Samples()
-        for windows in _chunks(taken):
+        for windows in _chunks(accepted):
             new = series.merge(new, await self._add(place, windows))
         return new
 
@@ -139,7 +139,7 @@ class SeriesWriter:
         half = len(windows) // 2
         return series.merge(await self._add(place, windows[:half]), await self._add(place, windows[half:]))
 
-    async def _write(self, place: Place, windows: _Windows, existing: _Known) -> Samples | None:
+    async def _write(self, place: Place, windows: _Windows, existing: _CachedRows) -> Samples | None:
         """Decide and write; ``None``: too large for one batch.
 
         Raises:
@@ -156,15 +156,15 @@ class SeriesWriter:
         for start_ms, window in windows:
             key = series.key(RAW, start_ms)
             row = existing.rows.get(key)
-            there = series.unpack(row.data) if row else Samples()
-            created = series.new_samples(_only(window, names), there)
-            fitting = series.fit_window(created, there)
+            stored = series.unpack(row.data) if row else Samples()
+            created = series.new_samples(_only(window, names), stored)
+            fitting = series.fit_window(created, stored)
             if len(fitting) < len(created):
                 _log.warning("%s: %d samples are more than a window holds", place, len(created) - len(fitting))
             if not fitting:
                 continue
             new = series.merge(new, fitting)
-            writes.append(existing.write(partition, key, series.pack(series.merge(there, fitting))))
+            writes.append(existing.write(partition, key, series.pack(series.merge(stored, fitting))))
             _into(buckets, existing, start_ms, series.summarize(fitting))
         if not new:
             return new
@@ -177,26 +177,26 @@ class SeriesWriter:
         writes += (existing.write(partition, key, each.data()) for key, each in buckets.items())
         writes.append(existing.write(partition, ABOUT, records.to_data(_grown(about, new, names))))
         await self._note(partition, existing, buckets)
-        self._remember(partition, windows[-1][0], await self._tables.batch(records.SERIES, writes))
+        self._cache_rows(partition, windows[-1][0], await self._tables.batch(records.SERIES, writes))
         return new
 
-    def _remember(self, partition: str, start_ms: int, written: Sequence[Row]) -> None:
+    def _cache_rows(self, partition: str, start_ms: int, written: Sequence[Row]) -> None:
         """Cache the rows that further samples of this window change, so that live streams need no reads."""
         rows = {row.key: row for row in written}
         about = rows.pop(ABOUT)
         keys = {series.key(level, _start(level, start_ms)) for level in (RAW, *LEVELS)}
         if keys <= rows.keys():
-            while len(self._written) >= MAX_WRITTEN:
+            while len(self._written) >= MAX_CACHED:
                 self._written.pop(next(iter(self._written)))
-            self._written[partition] = _Known(about, {key: rows[key] for key in keys}, start_ms)
+            self._written[partition] = _CachedRows(about, {key: rows[key] for key in keys}, start_ms)
 
-    async def _read(self, partition: str, first_ms: int, last_ms: int) -> _Known:
+    async def _read(self, partition: str, first_ms: int, last_ms: int) -> _CachedRows:
         """All rows that samples between the two windows may change."""
         ranges = [(level, _start(level, first_ms), _start(level, last_ms)) for level in (RAW, *LEVELS)]
         keys = [(ABOUT, ABOUT), *((series.key(level, first), series.key(level, last)) for level, first, last in ranges)]
         pages = await asyncio.gather(*(self._rows(partition, first, last) for first, last in keys))
         rows = {row.key: row for page in pages for row in page}
-        return _Known(rows.pop(ABOUT, None), rows)
+        return _CachedRows(rows.pop(ABOUT, None), rows)
 
     async def _rows(self, partition: str, first: str, last: str) -> tuple[Row, ...]:
         if first == last:
@@ -219,7 +219,7 @@ class SeriesWriter:
             _log.debug("%s is listed already", place)
         return True
 
-    async def _note(self, partition: str, existing: _Known, buckets: dict[str, Bucket]) -> None:
+    async def _note(self, partition: str, existing: _CachedRows, buckets: dict[str, Bucket]) -> None:
         """Schedule the deletion of a new day's rows, before they are written."""
         for key in buckets:
             if not key.startswith(f"{DAY.name}:") or key in existing.rows:
@@ -227,10 +227,10 @@ class SeriesWriter:
             begin_ms = series.start_of(key)
             end_ms = begin_ms + DAY.span_ms
             for level in (RAW, *LEVELS):
-                kept_ms = self._keep.of(level)
-                if kept_ms is not None:
+                keep_ms = self._keep.of(level)
+                if keep_ms is not None:
                     first, last = series.key(level, begin_ms), series.key(level, end_ms)
-                    due_ms = end_ms + kept_ms + MARGIN_MS
+                    due_ms = end_ms + keep_ms + MARGIN_MS
                     await self._retention.delete_rows_at(
                         records.SERIES, partition, first=first, last=last, due_ms=due_ms
                     )
@@ -255,7 +255,7 @@ def _start(level: Level, at_ms: int) -> int:
     return series.floor(at_ms, level.span_ms or series.WINDOW_MS)
 
 
-def _into(buckets: dict[str, Bucket], existing: _Known, start_ms: int, summary: Bucket) -> None:
+def _into(buckets: dict[str, Bucket], existing: _CachedRows, start_ms: int, summary: Bucket) -> None:
     """Add a summary to all buckets that contain the window."""
     for level in LEVELS:
         key = series.key(level, _start(level, start_ms))

@@ -25,7 +25,7 @@ UNREGISTERED_MS = 24 * 3_600_000
 MAX_UNREGISTERED = 100
 """Maximum number of unregistered uploads per device."""
 SHARDS = 8
-_NOTES = 25
+_MAX_DELETIONS = 25
 _DUE = "due"
 _SLACK_MS = 600_000
 """Registration ends this long before the deletion, because clocks differ [ms]."""
@@ -78,7 +78,7 @@ class Announced:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class StoredCapture:
     """A capture with its row."""
 
     capture: Capture
@@ -95,31 +95,31 @@ class Uploads:
         self._clock = clock
         self._turn = 0
 
-    async def begin(self, device: Device, wanted: Announced, *, by: str) -> tuple[Capture, port.Upload]:
+    async def begin(self, device: Device, announced: Announced, *, by: str) -> tuple[Capture, port.Upload]:
         """A new capture, and the request that uploads it.
 
         Raises:
             Problem: ``invalid``, ``too-many-uploads``.
         """
-        if not 0 <= wanted.length <= port.MAX_UPLOAD_BYTES:
+        if not 0 <= announced.length <= port.MAX_UPLOAD_BYTES:
             raise invalid(f"An upload has 0 to {port.MAX_UPLOAD_BYTES} bytes.")
         now_ms = self._clock.now_ms()
-        await self._refuse_too_many(device)
+        await self._require_capacity(device)
         id_ = new_suffix(now_ms)
         capture = Capture(
             id=id_,
-            stream=wanted.stream,
-            name=wanted.name,
-            at_ms=now_ms if wanted.at_ms is None else wanted.at_ms,
-            content_type=wanted.content_type,
-            length=wanted.length,
-            sha256=wanted.sha256,
+            stream=announced.stream,
+            name=announced.name,
+            at_ms=now_ms if announced.at_ms is None else announced.at_ms,
+            content_type=announced.content_type,
+            length=announced.length,
+            sha256=announced.sha256,
             blob=f"uploads/{device.id}/{device.pairing}/{id_}",
             by=by,
             created_ms=now_ms,
             expires_ms=now_ms + UNREGISTERED_MS,
         )
-        await self._note(device, capture.id, capture.expires_ms)
+        await self._schedule_deletion(device, capture.id, capture.expires_ms)
         await self._tables.create(records.UPLOADS, Row(_partition(device), _waiting(id_), records.to_data(capture)))
         request = await self._blobs.presign_upload(
             capture.blob, length=capture.length, content_type=capture.content_type, lifetime_s=LIFETIME_S
@@ -140,17 +140,19 @@ class Uploads:
         if now_ms >= capture.expires_ms - _SLACK_MS:
             raise not_found("upload", upload)
         verified = await self._check(capture)
-        kept = replace(capture, state="stored", verified=verified, stored_ms=now_ms, expires_ms=now_ms + self._keep_ms)
-        await self._note(device, capture.id, kept.expires_ms)
+        registered = replace(
+            capture, state="stored", verified=verified, stored_ms=now_ms, expires_ms=now_ms + self._keep_ms
+        )
+        await self._schedule_deletion(device, capture.id, registered.expires_ms)
         writes = [
             Write("delete", waiting),
-            Write("create", Row(waiting.partition, _registered(capture.id), records.to_data(kept))),
+            Write("create", Row(waiting.partition, _registered(capture.id), records.to_data(registered))),
         ]
         try:
             await self._tables.batch(records.UPLOADS, writes)
         except Conflict:
             return (await self._stored(device, upload)).capture
-        return kept
+        return registered
 
     async def list(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Capture], str | None]:
         """Registered captures, newest first.
@@ -191,7 +193,7 @@ class Uploads:
         """
         result = await self._stored(device, upload)
         now_ms = self._clock.now_ms()
-        await self._note(device, result.capture.id, now_ms)
+        await self._schedule_deletion(device, result.capture.id, now_ms)
         # From here on it is deleted for all callers, even if this process is killed.
         ended = replace(result.capture, expires_ms=now_ms)
         row = Row(result.row.partition, result.row.key, records.to_data(ended), result.row.etag)
@@ -202,7 +204,7 @@ class Uploads:
         except Conflict as error:
             raise busy_store() from error
 
-    async def forget_due(self) -> None:
+    async def delete_due(self) -> None:
         """Delete a part of the unregistered and expired captures.
 
         Raises:
@@ -211,24 +213,24 @@ class Uploads:
         self._turn += 1
         now_ms = self._clock.now_ms()
         shard = f"{_DUE}:{self._turn % SHARDS}"
-        page = await self._tables.query(records.UPLOADS, shard, last=f"{now_ms + 1:013d}", limit=_NOTES)
-        for note in page.rows:
+        page = await self._tables.query(records.UPLOADS, shard, last=f"{now_ms + 1:013d}", limit=_MAX_DELETIONS)
+        for deletion in page.rows:
             try:
-                for key in (_waiting(note.data["id"]), _registered(note.data["id"])):
-                    row = await self._tables.get(records.UPLOADS, note.data["partition"], key)
+                for key in (_waiting(deletion.data["id"]), _registered(deletion.data["id"])):
+                    row = await self._tables.get(records.UPLOADS, deletion.data["partition"], key)
                     # A later expiry time has its own deletion.
                     if row is not None and row.data["expires_ms"] <= now_ms:
                         await self._blobs.delete(row.data["blob"])
                         await self._tables.delete(records.UPLOADS, row)
-                await self._tables.delete(records.UPLOADS, note)
+                await self._tables.delete(records.UPLOADS, deletion)
             except Conflict:
-                _log.debug("another process deletes %s", note.key)
+                _log.debug("another process deletes %s", deletion.key)
 
-    async def _stored(self, device: Device, upload: str) -> Found:
+    async def _stored(self, device: Device, upload: str) -> StoredCapture:
         row = await self._tables.get(records.UPLOADS, _partition(device), _registered(upload[:_ID]))
         if row is None or row.data["expires_ms"] <= self._clock.now_ms():
             raise not_found("upload", upload)
-        return Found(records.read(row, Capture), row)
+        return StoredCapture(records.read(row, Capture), row)
 
     async def _check(self, capture: Capture) -> bool:
         """Compare the content with the announced hash, if it is small enough to be read here.
@@ -241,19 +243,19 @@ class Uploads:
             detail = "There is no content yet. Upload it to the URL first, then complete the upload."
             raise Problem("upload-missing", 409, "Nothing was uploaded", detail)
         if length != capture.length:
-            await self._refuse(capture, f"The content has {length} bytes; {capture.length} were announced")
+            await self._reject(capture, f"The content has {length} bytes; {capture.length} were announced")
         if not capture.sha256 or length > port.MAX_BYTES:
             return False
         content = await self._blobs.get(capture.blob) or b""
         if hashlib.sha256(content).hexdigest() != capture.sha256:
-            await self._refuse(capture, "The content does not have the announced hash")
+            await self._reject(capture, "The content does not have the announced hash")
         return True
 
-    async def _refuse(self, capture: Capture, why: str) -> NoReturn:
+    async def _reject(self, capture: Capture, why: str) -> NoReturn:
         await self._blobs.delete(capture.blob)
         raise Problem("upload-mismatch", 409, "The content does not match", f"{why}. It was deleted; upload it again.")
 
-    async def _refuse_too_many(self, device: Device) -> None:
+    async def _require_capacity(self, device: Device) -> None:
         page = await self._tables.query(
             records.UPLOADS, _partition(device), first=_waiting(""), last=_waiting("~"), limit=MAX_UNREGISTERED
         )
@@ -261,7 +263,7 @@ class Uploads:
             detail = f"{MAX_UNREGISTERED} uploads of this device are not completed. Complete them, or wait a day."
             raise Problem("too-many-uploads", 409, "Too many uploads", detail)
 
-    async def _note(self, device: Device, upload: str, due_ms: int) -> None:
+    async def _schedule_deletion(self, device: Device, upload: str, due_ms: int) -> None:
         """Schedule the deletion, before the capture is written."""
         partition = _partition(device)
         shard = hashlib.sha256(upload.encode()).digest()[0] % SHARDS

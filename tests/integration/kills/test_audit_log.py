@@ -13,7 +13,7 @@ from function_app.__main__ import main
 from function_app.bootstrap import Functions
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import StoreError
-from function_app.services.audit.audit_log import ABANDON_MS, LOOK_MS
+from function_app.services.audit.audit_log import ABANDON_MS, CHECK_MS
 from function_app.services.storage import records as store
 from tests.harness.cloud.cloud import Cloud, settings
 from tests.harness.processes import Place, begin, kill, killed, run_here, show_code
@@ -39,7 +39,7 @@ def test_the_command_says_ok_or_names_the_first_broken_record(
     assert capsys.readouterr().out == f"{anna.account} {head}\n"
     assert main(["audit", "verify", "--account", "anna", "--expect", str(head)]) == 0
     assert main(["audit", "verify", "--account", "anna", "--expect", f"9:{'0' * 64}"]) == 1
-    assert "are gone" in capsys.readouterr().out
+    assert "are missing" in capsys.readouterr().out
     assert main(["audit", "verify", "--account", "anna", "--expect", "x"]) == 2
     assert main(["audit", "verify", "--expect", str(head)]) == 2
     with sqlite3.connect(home / "tables.sqlite", isolation_level=None) as db:
@@ -70,7 +70,7 @@ async def chain_records(functions: Functions, chain: str = OWNER) -> list[dict[s
 async def later(functions: Functions) -> None:
     """Run the timer after all time limits."""
     clock: Any = functions.clock
-    for seconds in (2 * LOOK_MS / 1000 + 1, ABANDON_MS / 1000 + 1, 2 * LOOK_MS / 1000 + 1):
+    for seconds in (2 * CHECK_MS / 1000 + 1, ABANDON_MS / 1000 + 1, 2 * CHECK_MS / 1000 + 1):
         clock.advance(seconds)
         await functions.scheduler.run_due_jobs()
 

@@ -114,7 +114,7 @@ def test_an_unresponsive_broker_does_not_delay_requests(
         await asyncio.Event().wait()
 
     with monkeypatch.context() as patch:
-        patch.setattr("function_app.services.sharing.access_revocation.TELL_S", 0.2)
+        patch.setattr("function_app.services.sharing.access_revocation.NOTIFY_S", 0.2)
         patch.setattr(cloud.functions.access, "revoke", never)
         patch.setattr(cloud.functions.bus, "publish", never)
         answer = anna.post(at, {"account": "bert", "role": "viewer"})

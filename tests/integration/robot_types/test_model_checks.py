@@ -14,7 +14,7 @@ from device_agent.protocol.manifests.robot_type import RobotType
 from function_app.adapters.model_compiler.compiler import MujocoCompiler
 from function_app.entrypoints.hosts.worker import check_models
 from function_app.ports.model_compiler import CompilerMissingError, ModelReport
-from function_app.services.robot_types.cleanup import CUT_OFF, NO_CHECKER
+from function_app.services.robot_types.cleanup import INTERRUPTED, NO_VALIDATOR
 from function_app.services.robot_types.model_validation import LEASE_MS, MAX_TRIES
 from function_app.services.robot_types.versions import GIVE_UP_MS
 from function_app.services.storage import records
@@ -50,7 +50,7 @@ class TestChecker:
         assert anna.get("/robot-types/lever").json()["state"] == "checking"
         advance(cloud, 1_000)
         shown = anna.get("/robot-types/lever").json()
-        assert (shown["state"], shown["upload"]["errors"]) == ("rejected", [NO_CHECKER])
+        assert (shown["state"], shown["upload"]["errors"]) == ("rejected", [NO_VALIDATOR])
         check_all(cloud)
         assert anna.get("/robot-types/lever").json()["state"] == "rejected", "a result must not change"
         assert add(anna, wait_ms=0).json()["version"] == 2
@@ -139,7 +139,7 @@ class TestChecker:
             advance(cloud, GIVE_UP_MS)
             state = anna.get("/robot-types/lever")
             if state.status_code == 200:
-                assert state.json()["upload"]["errors"][0] in {CUT_OFF, NO_CHECKER}
+                assert state.json()["upload"]["errors"][0] in {INTERRUPTED, NO_VALIDATOR}
             else:
                 problem(state, 404, "robot-type-unknown")
             anna = cloud.sign_in("anna")

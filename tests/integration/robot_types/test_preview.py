@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from function_app.services.robot_types.preview import MAX_LOOKS
-from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_LOOK_MS
+from function_app.services.robot_types.preview import MAX_PREVIEWS
+from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_PREVIEW_MS
 from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS
 from tests.harness.cloud.cloud import Cloud, Person, problem
@@ -142,7 +142,7 @@ class TestErrors:
 class TestExpiry:
     def test_a_preview_expires_and_the_timer_deletes_it(self, cloud: Cloud, anna: Person) -> None:
         found = checked(cloud, anna)
-        advance(cloud, KEEP_LOOK_MS - _SLOW_MS)
+        advance(cloud, KEEP_PREVIEW_MS - _SLOW_MS)
         assert anna.get(f"{PREVIEWS}/{found['id']}").status_code == 200
         cloud.clock.advance(_SLOW_MS / 1000)
         anna = cloud.sign_in("anna")
@@ -163,12 +163,12 @@ class TestExpiry:
 
     def test_a_preview_above_the_limit_replaces_the_oldest(self, cloud: Cloud, anna: Person) -> None:
         created = []
-        for _ in range(MAX_LOOKS + 2):
+        for _ in range(MAX_PREVIEWS + 2):
             created.append(preview(anna).json()["id"])
             advance(cloud, 10)
         existing = [name for name in created if anna.get(f"{PREVIEWS}/{name}").status_code == 200]
         assert existing == created[2:]
-        assert len(previews(cloud, anna)) == MAX_LOOKS
+        assert len(previews(cloud, anna)) == MAX_PREVIEWS
 
     @pytest.mark.parametrize("saving", [False, True])
     def test_a_preview_killed_at_any_write_leaves_no_data(
@@ -190,7 +190,7 @@ class TestExpiry:
         assert cut > 5
         for _ in range(3):
             check_all(cloud)
-            advance(cloud, KEEP_LOOK_MS)
+            advance(cloud, KEEP_PREVIEW_MS)
         anna = cloud.sign_in("anna")
         assert previews(cloud, anna) == []
         remaining = {name.split("/")[2] for name in blobs(cloud)}

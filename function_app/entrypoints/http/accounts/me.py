@@ -32,8 +32,8 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         """
         caller = await auth.account(request)
         payload: schemas.PasswordRequest = await read(request, schemas.PasswordRequest)
-        origin = sign_in_origin(request, functions.settings)
-        await functions.passwords.put(caller, payload.password, old=payload.old_password, whence=origin)
+        origin = whence(request, functions.settings)
+        await functions.passwords.put(caller, payload.password, old=payload.old_password, origin=origin)
         return empty()
 
     @routes.add("GET /accounts/me/sessions", "List sign-in sessions", schemas.SessionList)

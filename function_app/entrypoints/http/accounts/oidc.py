@@ -11,7 +11,7 @@ from function_app.entrypoints.http.accounts.cookies import secure, set_session, 
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, reject_cross_site
 from function_app.entrypoints.http.framework.responses import json_response, read
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
-from function_app.services.accounts.oidc_sign_in import BEGUN_S, OidcCallback, OidcRedirect
+from function_app.services.accounts.oidc_sign_in import SIGN_IN_TIMEOUT_S, OidcCallback, OidcRedirect
 from function_app.settings import Settings
 
 COOKIE = "telescope_sign_in"
@@ -85,9 +85,9 @@ def router(functions: Functions, _auth: RequestAuthenticator) -> Routes:
     return routes
 
 
-def _state_cookie(settings: Settings, redirect: OidcRedirect) -> str:
-    cookie = f"{COOKIE}={redirect.secret}; Path={PREFIX}{_PATH}; Max-Age={BEGUN_S}; HttpOnly; SameSite=Lax"
-    return cookie + secure(settings)
+def _mark(settings: Settings, redirect: OidcRedirect) -> str:
+    mark = f"{COOKIE}={redirect.secret}; Path={PREFIX}{_PATH}; Max-Age={SIGN_IN_TIMEOUT_S}; HttpOnly; SameSite=Lax"
+    return mark + secure(settings)
 
 
 def _redirect(address: str, cookie: str | None = None) -> Response:

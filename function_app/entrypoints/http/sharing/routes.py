@@ -13,7 +13,7 @@ from function_app.entrypoints.http.framework.responses import empty, json_respon
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.framework.schemas import AccountRef
 from function_app.entrypoints.http.sharing import schemas
-from function_app.services.sharing.invitations import Known, Offer
+from function_app.services.sharing.invitations import KnownInvitation, Offer
 from function_app.services.sharing.shares import Target
 
 _INCOMPLETE: Final = (
@@ -301,7 +301,7 @@ class _Sharing:
         return json_response(body, 201, headers={"Cache-Control": "no-store"})
 
 
-def _invitation(view: Known) -> dict[str, Any]:
+def _invitation(view: KnownInvitation) -> dict[str, Any]:
     invitation = view.invitation
     kind, target = split_target(invitation.on)
     return {

@@ -46,7 +46,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         payload: schemas.LatencyRequest = await read(request, schemas.LatencyRequest)
         target = require_operator(await functions.devices.get(caller, device))
         sender = f"account:{caller.account}"
-        await functions.latencies.add(target, _samples(payload), caller=sender, once=idempotency_key or "")
+        await functions.latencies.add(target, _samples(payload), caller=sender, idempotency_key=idempotency_key or "")
         return empty()
 
     @routes.add(
@@ -63,7 +63,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         payload: schemas.AgentLatencyRequest = await read(request, schemas.AgentLatencyRequest)
         device = own_device(caller, agent, payload.device)
         sender = f"agent:{caller.id}"
-        await functions.latencies.add(device, _samples(payload), caller=sender, once=idempotency_key or "")
+        await functions.latencies.add(device, _samples(payload), caller=sender, idempotency_key=idempotency_key or "")
         return empty()
 
     @routes.add("GET /devices/{device}/latency", "Get latency statistics", schemas.LatencyList, (404, 422))

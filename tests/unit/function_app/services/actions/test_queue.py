@@ -3,7 +3,7 @@
 from device_agent.protocol import AckStatus, CancelAction, MoveJoints, ResetStop, codec, topics
 from function_app.domain.actions.action import GRACE_MS
 from function_app.domain.actions.queue import MAX_QUEUED
-from function_app.services.actions.queue import LOOK_MS
+from function_app.services.actions.queue import CHECK_MS
 from tests.fakes.agent import Robot
 from tests.fixtures.cloud import OpenCloud
 from tests.harness.cloud.cloud import MOVE, Cloud, Person, problem
@@ -165,7 +165,7 @@ class TestEnds:
         robot.fail(running, "stopped", "The device was stopped.")
         assert anna.post(f"/devices/{robot.device}/stop/reset").status_code == 200
         assert robot.received(ResetStop)
-        pass_time(anna.cloud, 2 * LOOK_MS / 1000 + 1)
+        pass_time(anna.cloud, 2 * CHECK_MS / 1000 + 1)
         assert sent(robot) == [running]
 
 

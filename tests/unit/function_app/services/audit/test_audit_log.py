@@ -145,7 +145,7 @@ def test_a_repeated_write_is_recorded_once(cloud: Cloud, monkeypatch: pytest.Mon
 
     async def work() -> list[str]:
         async with functions.audit_log.change(OWNER, "changed", CALLER) as change:
-            await change.noted()
+            await change.store_pending()
         await asyncio.gather(*(functions.audit_log.record(OWNER, f"did {number}", CALLER) for number in range(3)))
         repeated = entry("repeated", CALLER, entry_id="repeated", at_ms=functions.clock.now_ms())
         for _ in range(2):

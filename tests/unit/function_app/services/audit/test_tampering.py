@@ -123,7 +123,7 @@ def test_changed_bytes(written: Written) -> None:
 def test_swapped_inserted_repeated_and_foreign_records(written: Written) -> None:
     rows, check = written.rows, written.check
     assert "record 4:" in check({**rows, key(4): rows[key(5)], key(5): rows[key(4)]})
-    assert "behind the head" in check({**rows, key(11): rows[key(10)]})
+    assert "newer than the head" in check({**rows, key(11): rows[key(10)]})
     shifted = {key(seq + 1): rows[key(seq)] for seq in range(4, 11)}
     assert "record 4:" in check({**rows, **shifted, key(4): rows[key(3)]})
     foreign = rows_of(written.tables, "other")
@@ -136,10 +136,10 @@ def test_forged_and_missing_heads(written: Written) -> None:
     cut = {name: text for name, text in rows.items() if name != key(10)}
     forged = {**json.loads(rows["head"]), "seq": 9, "hash": json.loads(rows[key(9)])["hash"]}
     assert "signature" in check({**cut, "head": json.dumps(forged).encode()})
-    assert "none of this cloud's" in check({**cut, "head": json.dumps({**forged, "key": "0" * 16}).encode()})
-    assert "head is gone" in check({name: text for name, text in rows.items() if name != "head"})
-    assert "record 1: it and all after it are gone" in check({}), "the anchor has five records"
-    assert "another one was noted" in check(rows, Head(7, "0" * 64))
+    assert "unknown or leaked key" in check({**cut, "head": json.dumps({**forged, "key": "0" * 16}).encode()})
+    assert "head is missing" in check({name: text for name, text in rows.items() if name != "head"})
+    assert "record 1 and all later ones are missing" in check({}), "the anchor has five records"
+    assert "differs from the anchor" in check(rows, Head(7, "0" * 64))
     assert "two different heads" in check(rows, Head(5, "0" * 64))
 
 
@@ -157,6 +157,6 @@ def test_a_chain_restored_to_an_old_state_contradicts_newer_anchors(cloud: Cloud
     assert newest is not None
     put(memory.tables, old)
     assert verdict(cloud) == ""
-    assert "record 4: it and all after it are gone" in verdict(cloud, newest)
+    assert "record 4 and all later ones are missing" in verdict(cloud, newest)
     cloud.run(cloud.functions.blobs.append(anchors(OWNER), f'{{"seq":6,"hash":"{newest.hash}"}}\n'.encode()))
-    assert "record 4: it and all after it are gone" in verdict(cloud)
+    assert "record 4 and all later ones are missing" in verdict(cloud)

@@ -16,13 +16,13 @@ def test_tokens_due_for_a_check_are_not_cached(cloud: Cloud) -> None:
         early = [await authenticator.issue(caller, API, 600) for _ in range(5)]
         for token in early:
             assert (await authenticator.person(token, API)).account == "account"
-        assert len(authenticator._known) == len(early)
+        assert len(authenticator._cache) == len(early)
         cloud.clock.advance(RECHECK_MS / 1000 - 1)
         await authenticator.person(early[0], API)
         cloud.clock.advance(2)
         late = await authenticator.issue(caller, API, 600)
         await authenticator.person(late, API)
-        assert set(authenticator._known) == {(API, late)}
+        assert set(authenticator._cache) == {(API, late)}
         assert (await authenticator.person(early[1], API)).account == "account", "valid, cached or not"
         cloud.clock.advance(601)
         with pytest.raises(Problem, match="expired"):

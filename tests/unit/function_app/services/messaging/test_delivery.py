@@ -22,9 +22,9 @@ ARM = Device(
 class BusyMailbox(Mailbox):
     """A mailbox that changes after each read."""
 
-    async def stored_answer(self, agent: str, command: str) -> None:
-        asyncio.get_running_loop().call_soon(self._ring, agent)
-        assert await super().stored_answer(agent, command) is None
+    async def stored_ack(self, agent: str, command: str) -> None:
+        asyncio.get_running_loop().call_soon(self._notify, agent)
+        assert await super().stored_ack(agent, command) is None
 
 
 async def confirmed(wait_ms: int) -> bool:

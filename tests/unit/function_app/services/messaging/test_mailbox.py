@@ -20,7 +20,7 @@ from device_agent.protocol import (
 )
 from function_app.domain.devices.devices import POLL_MARK_MS, POLL_SILENT_MS
 from function_app.services.maintenance.scheduler import ORPHAN_MS
-from function_app.services.messaging.command_sender import SHORT_TTL_MS, STOP_KEPT_MS
+from function_app.services.messaging.command_sender import SHORT_TTL_MS, STOP_LIFETIME_MS
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.fakes.broker_ports import MemoryCommandBus
@@ -150,7 +150,7 @@ def test_an_expired_command_is_not_delivered_but_a_late_stop_is(
     anna.post(f"/devices/{robot.device}/stop")
     cloud.clock.advance(SHORT_TTL_MS / 1000)
     assert [type(request) for request in robot.read(robot.fetch())] == [StopDevice]
-    cloud.clock.advance((STOP_KEPT_MS - SHORT_TTL_MS) / 1000)
+    cloud.clock.advance((STOP_LIFETIME_MS - SHORT_TTL_MS) / 1000)
     assert robot.fetch() == []
 
 

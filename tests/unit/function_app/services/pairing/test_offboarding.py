@@ -6,7 +6,7 @@ import pytest
 
 from device_agent.protocol import Description, Mode, MoveJoints, State, topics
 from function_app.services.maintenance.scheduler import ORPHAN_MS
-from function_app.services.pairing.offboarding import LOOK_MS
+from function_app.services.pairing.offboarding import CHECK_MS
 from function_app.services.storage import records
 from function_app.services.storage.reminders import SHARDS
 from tests.fakes.agent import Robot
@@ -58,7 +58,7 @@ def rest(cloud: Cloud, robot: Robot) -> dict[str, Any]:
 
 
 def pass_time(cloud: Cloud) -> None:
-    for seconds in (1, LOOK_MS / 1000, 1, ORPHAN_MS / 1000 + 1, 1):
+    for seconds in (1, CHECK_MS / 1000, 1, ORPHAN_MS / 1000 + 1, 1):
         cloud.clock.advance(seconds)
         cloud.sweep()
 

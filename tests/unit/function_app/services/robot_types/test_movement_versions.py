@@ -8,7 +8,7 @@ from cryptography.exceptions import InvalidSignature
 
 from device_agent.protocol.security import signing
 from function_app.ports.tables import Row
-from function_app.services.robot_types.movements import KEPT_MS
+from function_app.services.robot_types.movements import KEEP_SCRIPT_MS
 from function_app.services.storage import records
 from tests.harness.cloud.cloud import Cloud, Person, problem
 from tests.harness.cloud.memory import Memory
@@ -54,7 +54,7 @@ class TestVersions:
         assert [item["version"] for item in anna.get(f"{MINE}/versions").json()["items"]] == [4]
         problem(anna.get(MINE, params={"version": 2}), 404, "movement-version-unknown")
         assert len(scripts(memory)) == 4, "commands of running actions may be resent"
-        alone.clock.advance((KEPT_MS + 1_000) / 1000)
+        alone.clock.advance((KEEP_SCRIPT_MS + 1_000) / 1000)
         alone.run(alone.functions.retention.delete_due(alone.clock.now_ms()))
         assert scripts(memory) == ["# 1"]
         again = alone.sign_in("anna")
@@ -62,7 +62,7 @@ class TestVersions:
         page = alone.run(alone.functions.tables.query(records.MOVEMENTS, f"{anna.account}/ur5"))
         assert len(page.rows) == 2, "the row of the name and of its version"
         again.delete(MINE)
-        alone.clock.advance((KEPT_MS + 1_000) / 1000)
+        alone.clock.advance((KEEP_SCRIPT_MS + 1_000) / 1000)
         alone.run(alone.functions.retention.delete_due(alone.clock.now_ms()))
         assert scripts(memory) == []
         page = alone.run(alone.functions.tables.query(records.MOVEMENTS, f"{anna.account}/ur5"))

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from device_agent.protocol import ReleaseLease
-from function_app.services.pairing.offboarding import LOOK_MS
+from function_app.services.pairing.offboarding import CHECK_MS
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.fixtures.cloud import Crashing
@@ -193,7 +193,7 @@ def test_an_acceptance_killed_after_any_write_is_completed_by_the_timer(
     client.post("/invitations/redeem", {"secret": made["secret"]})
     cloud.clock.advance(11)
     cloud.sweep()
-    cloud.clock.advance(LOOK_MS / 1000 + 61)
+    cloud.clock.advance(CHECK_MS / 1000 + 61)
     cloud.sweep()
     if devices(anna):
         assert after <= 5, "only before the accepting write"

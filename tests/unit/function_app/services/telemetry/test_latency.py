@@ -167,7 +167,7 @@ def test_hours_are_deleted_after_their_retention_and_days_remain(cloud: Cloud, a
         page = cloud.run(cloud.functions.tables.query(records.LATENCY, partition, limit=1000))
         return {row.key.partition(":")[0] for row in page.rows}
 
-    assert kinds() == {"day", "hour", "fail_after_first", "recent"}
+    assert kinds() == {"day", "hour", "once", "recent"}
     cloud.clock.advance(11 * 86_400)
     cloud.sweep()
     assert kinds() == {"day", "hour", "recent"}

@@ -11,7 +11,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.domain.telemetry import series
 from function_app.domain.telemetry.series import Samples
 from function_app.services.storage import records
-from function_app.services.telemetry.ingest import GIVE_UP_MS, LEFT_MS, SHARDS, InboundMessage, _Part
+from function_app.services.telemetry.ingest import BACKLOG_MS, DROP_MS, SHARDS, InboundMessage, _Part
 from tests.harness.crash_injection import Killed
 from tests.unit.function_app.services.telemetry.telemetry_fixture import (
     AGENT,
@@ -96,7 +96,7 @@ async def test_queued_samples_are_not_visible_to_the_next_owner(setup: Telemetry
     device = (await setup.ingest._agent(AGENT)).devices["arm"]
     await setup.ingest._queue([_Part(device, "health", series.from_rows([(NOW_MS, {"a": 1.0})]))])
     await setup.pair(pairing="p2", account="bert")
-    setup.clock.at_ms += LEFT_MS + 1
+    setup.clock.at_ms += BACKLOG_MS + 1
     for _ in range(SHARDS):
         await setup.ingest.distribute_backlog()
     assert await _queued(setup) == 0
@@ -125,7 +125,7 @@ async def test_a_kill_between_any_two_writes_neither_loses_nor_duplicates_sample
         setup.crash.left = None
         if number == 0:
             continue  # nothing was written: the sender delivers the messages again
-        setup.clock.at_ms += LEFT_MS + 1
+        setup.clock.at_ms += BACKLOG_MS + 1
         _, ingest, _, _ = setup.instance()
         for _ in range(SHARDS):
             await ingest.distribute_backlog()
@@ -148,7 +148,7 @@ async def test_samples_that_cannot_be_distributed_are_dropped(setup: TelemetrySe
         raise Problem("busy", 503, "Busy", "Try again.")
 
     ingest._writer.add = busy  # type: ignore[assignment, method-assign]
-    for later_ms, left in ((LEFT_MS + 1, 1), (GIVE_UP_MS + 1, 0)):
+    for later_ms, left in ((BACKLOG_MS + 1, 1), (DROP_MS + 1, 0)):
         setup.clock.at_ms = NOW_MS + later_ms
         for _ in range(SHARDS):
             await ingest.distribute_backlog()

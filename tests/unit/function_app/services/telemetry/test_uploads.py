@@ -49,7 +49,7 @@ def listed(anna: Person, robot: Robot) -> list[str]:
 
 def delete_due(cloud: Cloud) -> None:
     for _ in range(SHARDS):
-        cloud.run(cloud.functions.uploads.forget_due())
+        cloud.run(cloud.functions.uploads.delete_due())
 
 
 def blobs(cloud: Cloud) -> tuple[str, ...]:
