@@ -159,7 +159,7 @@ class OidcSignIn:
         code = "oidc-uninvited"
         _log.warning("OIDC sign-in: %r (%r) has no account and no invitation", subject.name, subject.id)
         await self._audit_log.record_rejection(
-            CLOUD, AccountEvent.SIGN_IN_REFUSED, None, code=code, address=origin.address
+            CLOUD, AccountEvent.SIGN_IN_REJECTED, None, code=code, address=origin.address
         )
         detail = "You have no account here. Ask an owner for an invitation, or contact the operator of this server."
         raise Problem(code, 403, "Not invited", detail)

@@ -143,7 +143,9 @@ class Passwords:
         """Record each failure, also of unknown names, so that they take the same time."""
         wrong = code == WRONG
         data = {"code": code, "address": origin.address}
-        await self._audit_log.record_rejection(account or CLOUD, AccountEvent.SIGN_IN_REFUSED, None, each=wrong, **data)
+        await self._audit_log.record_rejection(
+            account or CLOUD, AccountEvent.SIGN_IN_REJECTED, None, each=wrong, **data
+        )
 
     async def _require_right(self, caller: Identity, row: Row | None, old: str | None, origin: SignInOrigin) -> None:
         if old is None:

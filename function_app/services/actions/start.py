@@ -241,7 +241,7 @@ class StartAction:
             control = await apply_ended_epoch(self._tables, device, control, caller, now_ms)
             if now_ms - draft.created_ms > ABANDON_MS:
                 raise busy_store()
-            existing = await self._existing(device, request, draft.once) if draft.once else None
+            existing = await self._existing(device, request, draft.idempotency_key) if draft.idempotency_key else None
             if existing is not None:
                 return existing, False
             before = control.action or next(iter((*control.queue.actions, *control.queue.dropped)), "")

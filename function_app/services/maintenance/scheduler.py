@@ -212,9 +212,9 @@ class Scheduler:
         if location is None:
             return
         await self._retention.delete_row_at(records.CONTROL, *location, due_ms=action.ended_ms + self._keep_actions_ms)
-        if action.once:
+        if action.idempotency_key:
             await self._retention.delete_row_at(
-                records.CONTROL, location[0], action.once, due_ms=action.created_ms + KEEP_ONCE_MS
+                records.CONTROL, location[0], action.idempotency_key, due_ms=action.created_ms + KEEP_ONCE_MS
             )
 
     async def _publish(self, result: StoredAction, now_ms: int) -> None:

@@ -42,7 +42,9 @@ class KeyAnnouncer:
         if target is None:
             return
         try:
-            await self._command_sender.send(target, RotateKey(statements=announcement.statements), caller=_CALLER, epoch=0)
+            await self._command_sender.send(
+                target, RotateKey(statements=announcement.statements), caller=_CALLER, epoch=0
+            )
         except (BusUnavailable, Problem) as error:
             _log.warning("the new key was not announced to agent %s: %s", agent.id, error)
             return

@@ -204,7 +204,7 @@ class Movements:
     async def delete(self, caller: Identity, robot_type: str, name: str) -> None:
         """Delete all versions of an own movement; a built-in one with the same name becomes visible again.
 
-        Running actions continue: the script remains for ``KEPT_MS``.
+        Running actions continue: the script remains for ``KEEP_SCRIPT_MS``.
 
         Raises:
             Problem: ``robot-type-unknown``, ``movement-unknown``, ``movement-built-in``.

@@ -166,9 +166,7 @@ def _check_references(name: str, text: bytes) -> None:
     def element(tag: str, attributes: dict[str, str]) -> None:
         for attribute, value in attributes.items():
             if (_FILE.match(attribute) or attribute.lower() in _FOLDERS) and _OUTSIDE.search(value):
-                outside.append(
-                    f'{name}: <{tag} {attribute}="{value[:120]}"> leads out of the robot type\'s folder.'
-                )
+                outside.append(f'{name}: <{tag} {attribute}="{value[:120]}"> leads out of the robot type\'s folder.')
 
     def doctype(*_: object) -> None:
         outside.append(f"{name}: a DOCTYPE is not allowed.")

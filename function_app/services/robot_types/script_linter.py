@@ -1,6 +1,6 @@
 """Static checks of movement scripts, without running them.
 
-An ``error`` prevents saving; a ``warning`` would probably fail at the robot. Names computed at run time are not checked.
+An ``error`` prevents saving; a ``warning`` would probably fail. Names computed at run time are not checked.
 """
 
 import ast

@@ -32,7 +32,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         """
         caller = await auth.account(request)
         payload: schemas.PasswordRequest = await read(request, schemas.PasswordRequest)
-        origin = whence(request, functions.settings)
+        origin = sign_in_origin(request, functions.settings)
         await functions.passwords.put(caller, payload.password, old=payload.old_password, origin=origin)
         return empty()
 

@@ -85,9 +85,9 @@ def router(functions: Functions, _auth: RequestAuthenticator) -> Routes:
     return routes
 
 
-def _mark(settings: Settings, redirect: OidcRedirect) -> str:
-    mark = f"{COOKIE}={redirect.secret}; Path={PREFIX}{_PATH}; Max-Age={SIGN_IN_TIMEOUT_S}; HttpOnly; SameSite=Lax"
-    return mark + secure(settings)
+def _state_cookie(settings: Settings, redirect: OidcRedirect) -> str:
+    cookie = f"{COOKIE}={redirect.secret}; Path={PREFIX}{_PATH}; Max-Age={SIGN_IN_TIMEOUT_S}; HttpOnly; SameSite=Lax"
+    return cookie + secure(settings)
 
 
 def _redirect(address: str, cookie: str | None = None) -> Response:

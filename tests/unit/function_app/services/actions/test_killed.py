@@ -51,7 +51,13 @@ def test_start(cloud: Cloud, robot: Robot, crashing: Crashing, reports: Any, req
         client = at_instance(process, anna)
         assert client.get("/accounts/me").status_code == 200
         crash_point.left = writes
-        options = {"idempotency_key": f"k{writes}", "wait_ms": 100, "wait_for": "done", "ttl_ms": 2_000, "timeout_ms": 6_000}
+        options = {
+            "idempotency_key": f"k{writes}",
+            "wait_ms": 100,
+            "wait_for": "done",
+            "ttl_ms": 2_000,
+            "timeout_ms": 6_000,
+        }
         assert (client.start(robot.device, **options, **request_).status_code < 500) is crash_point.survived
         before = set(control_rows(cloud, robot.device))
         assert anna.start(robot.device, **options, **request_).status_code in {200, 202}

@@ -48,7 +48,9 @@ class TestParameters:
         assert isinstance(command.request, RunMovement)
         assert command.request.parameters == {"who": "bert", "times": 3}
         assert started["request"]["parameters"] == {"who": "bert", "times": 3}
-        assert anna.start(robot.device, request=request, wait_ms=10_000, idempotency_key="x").json()["id"] == started["id"]
+        assert (
+            anna.start(robot.device, request=request, wait_ms=10_000, idempotency_key="x").json()["id"] == started["id"]
+        )
 
     @pytest.mark.parametrize(
         ("parameters", "place"),

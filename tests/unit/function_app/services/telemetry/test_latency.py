@@ -1,4 +1,4 @@
-"""The latency store counts each batch fail_after_first and computes percentiles per device, transport and path."""
+"""The latency store counts each batch once and computes percentiles per device, transport and path."""
 
 import math
 import random

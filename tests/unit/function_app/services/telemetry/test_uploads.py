@@ -110,8 +110,8 @@ def test_an_upload_may_be_larger_than_any_request_body(cloud: Cloud, anna: Perso
 
 def test_an_upload_that_differs_from_its_announcement_is_refused(cloud: Cloud, anna: Person, robot: Robot) -> None:
     upload_request = begin(anna, robot, sha256="0" * 64)
-    problem(send(cloud, upload_request, PICTURE[1:]), 403, "transfer-refused")
-    problem(send(cloud, upload_request, PICTURE, **{"Content-Type": "text/html"}), 403, "transfer-refused")
+    problem(send(cloud, upload_request, PICTURE[1:]), 403, "transfer-rejected")
+    problem(send(cloud, upload_request, PICTURE, **{"Content-Type": "text/html"}), 403, "transfer-rejected")
     problem(complete(anna, robot, upload_request["id"]), 409, "upload-missing")
     assert send(cloud, upload_request, PICTURE).status_code == 201
     problem(complete(anna, robot, upload_request["id"]), 409, "upload-mismatch")
