@@ -110,7 +110,7 @@ def test_an_action_of_a_former_operator_is_not_resent(
         raise Problem("killed", 500, "Killed", "Killed.")
 
     with monkeypatch.context() as patch:
-        patch.setattr(cloud.functions.start_action, "_require_still", killed)
+        patch.setattr(cloud.functions.start_action, "_require_still_allowed", killed)
         assert bert.start(robot.device).status_code == 500
     (action,) = anna.get(f"/devices/{robot.device}/actions").json()["items"]
     assert action["status"] == "created"

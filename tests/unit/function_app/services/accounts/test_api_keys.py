@@ -95,7 +95,7 @@ def test_invalid_keys_are_refused(cloud: Cloud, monkeypatch: pytest.MonkeyPatch)
     anna = cloud.sign_in("anna")
     for wrong in ({"role": "owner"}, {"days": 0}, {"days": 367}, {"name": ""}, {"only": ["a b"]}, {"more": 1}):
         problem(anna.post(KEYS, {"name": "x", "role": "viewer", **wrong}), 422, "invalid")
-    monkeypatch.setattr("function_app.services.accounts.api_keys.MOST", 2)
+    monkeypatch.setattr("function_app.services.accounts.api_keys.MAX_KEYS", 2)
     for _ in range(2):
         make(anna)
     problem(anna.post(KEYS, {"name": "x", "role": "viewer"}), 409, "too-many-keys")

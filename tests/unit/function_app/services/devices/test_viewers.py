@@ -72,7 +72,7 @@ class TestViewing:
     def test_rows_are_bounded_and_deleted(
         self, cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(viewers, "MOST", 3)
+        monkeypatch.setattr(viewers, "MAX_VIEWERS", 3)
         people = [anna, *(cloud.sign_in("anna") for _ in range(4))]
         assert [len(view(person, robot)) for person in people] == [0, 1, 2, 3, 3]
         assert len(rows(cloud, robot)) == 3
