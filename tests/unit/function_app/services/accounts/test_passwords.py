@@ -54,7 +54,7 @@ def test_only_a_slow_hash_is_stored_and_renewed(cloud: Cloud, anna: Person, monk
     assert GOOD not in str(row)
     monkeypatch.setattr(password_hasher, "PASSES", 3)
     hasher: Any = cloud.functions.passwords._hasher
-    hasher._made = None
+    hasher._library = None
     assert sign_in(cloud, "anna", GOOD).status_code == 200
     assert "t=3" in password_row(cloud, anna.account)["hash"], "with the newer parameters"
     assert sign_in(cloud, "anna", GOOD).status_code == 200
