@@ -83,7 +83,7 @@ def test_sweeps_agree_with_sampling(shape: MujocoGeometry) -> None:
 def test_cached_bounds_agree_with_measurements(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(8)
     measuring = MujocoGeometry(KIND, UR5 / KIND.scene)
-    monkeypatch.setattr(measuring._checker, "_surely_clear", lambda _: False)
+    monkeypatch.setattr(measuring._checker, "_clear_by_bounds", lambda _: False)
     counts = {True: 0, False: 0}
     for start in free(shape, 25, 4):
         heading = random.uniform(-0.06, 0.06, len(start))
