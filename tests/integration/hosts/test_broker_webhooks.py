@@ -125,7 +125,7 @@ class TestIotCore(WebhookSuite):
     def test_a_request_without_client_or_with_another_broker_is_rejected(self, gate: IotGate, tmp_path: Path) -> None:
         request: dict[str, Any] = {"protocolData": {}}
         assert gate.cloud.run(authorise(gate.cloud.functions, request, ARN))["isAuthenticated"] is False
-        with Cloud(settings(tmp_path)) as cloud, pytest.raises(ValueError, match="nothing to ask"):
+        with Cloud(settings(tmp_path)) as cloud, pytest.raises(ValueError, match="requires iot"):
             cloud.run(authorise(cloud.functions, request, ARN))
 
 

@@ -43,5 +43,7 @@ R = TypeVar("R", bound=Response)
 
 def response_from(source: object, kind: type[R], /, **more: Any) -> R:
     """A response with the attributes of ``source`` that have the same names, and the fields in ``more``."""
-    names = (name for name in kind.__struct_fields__ if name not in more and hasattr(source, name))
-    return kind(**{name: getattr(source, name) for name in names}, **more)
+    fields = kind.__struct_fields__
+    return kind(
+        **{name: getattr(source, name) for name in fields if name not in more and hasattr(source, name)}, **more
+    )
