@@ -100,7 +100,7 @@ def check_trend(page: Page, machine: Machine, device: str) -> None:
     row = page.get_by_test_id("watched-row").first
     expect(row).to_have_attribute("data-field", "co2.co2_ppm")
     expect(row).to_contain_text("Limit exceeded")
-    expect(row).to_contain_text("Open door or window")  # advice of the room's manifest
+    expect(row).to_contain_text("Open the door or a window")  # advice of the room's manifest
     chart = page.get_by_test_id("series")
     wait_until(lambda: int(chart.get_attribute("data-points") or "0") > 5, "points")
     chart.focus()
