@@ -9,7 +9,7 @@ NODE = PATH="$(if $(wildcard $(BIN)/npm),$(CURDIR)/$(BIN):)$$PATH" npm
 NPM = $(NODE) --prefix web
 
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes
-PYTEST := $(BIN)/python -m pytest
+PYTEST := tests/mounted-root $(BIN)/python -m pytest
 # Excludes suites at full size and samples expensive families; the sample depends on the commit.
 SEED ?= $(shell git rev-parse --short HEAD 2>/dev/null || echo 0)
 SAMPLE = $(PYTEST) -q -m "not long" --sample $(SEED)
