@@ -95,11 +95,21 @@ class SandboxHost:
                 return str(error)
         if self._own.missing and not self._allow_unconfined:
             return f"{self._lack_message(self._own)} {_REMEDY}"
-        if untrusted and shutil.which("bwrap") is None:
-            return (
-                "scripts of accounts other than the robot's owner need bubblewrap, which is not installed. Install it "
-                "(Debian: apt-get install bubblewrap), or save the movement with the owner's account."
-            )
+        return self._bubblewrap_refusal() if untrusted else None
+
+    def _bubblewrap_refusal(self) -> str | None:
+        need = "scripts of accounts other than the robot's owner need bubblewrap, which"
+        otherwise = "or save the movement with the owner's account."
+        if shutil.which("bwrap") is None:
+            return f"{need} is not installed. Install it (Debian: apt-get install bubblewrap), {otherwise}"
+        with self._lock:
+            try:
+                self._wrapped.start()
+            except SandboxError:
+                return (
+                    f"{need} cannot start on this machine. Run `bwrap --ro-bind / / true` to see the cause (chroots "
+                    f"and containers often do not allow namespaces), {otherwise}"
+                )
         return None
 
     @property

@@ -217,3 +217,12 @@ def test_scripts_are_rejected_if_the_kernel_lacks_a_layer_unless_allowed(blocked
     assert lenient is None
     assert "7" in messages
     assert "SandboxError" in error
+
+
+def test_a_bubblewrap_that_cannot_start_is_reported_as_the_cause(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(host, "_bubblewrap", lambda: ("false",))
+    with contextlib.closing(SandboxHost()) as sandbox:
+        assert sandbox.refusal(untrusted=False) is None
+        assert "bubblewrap, which cannot start on this machine" in (sandbox.refusal(untrusted=True) or "")
+        with pytest.raises(SandboxError, match="cannot start"):
+            sandbox.open(Limits(), untrusted=True)
