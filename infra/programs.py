@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import math
 import shutil
 import signal
 import socket
@@ -104,12 +105,12 @@ def supervise(
     Returns:
         The exit code.
     """
-    stopping = False
+    kill_at = math.inf  # a finite time after the signal that asks this program to stop
     child: subprocess.Popen[bytes] | None = None
 
     def stop(_: int, __: FrameType | None) -> None:
-        nonlocal stopping
-        stopping = True
+        nonlocal kill_at
+        kill_at = time.monotonic() + _STOP_S
         if child is not None:
             child.terminate()
 
@@ -122,19 +123,21 @@ def supervise(
         preexec_fn=lambda: signal_with_parent(signal.SIGKILL),  # noqa: PLW1509 (single-threaded)
         start_new_session=True,  # Ctrl-C only reaches this program, which stops the server
     )
-    if stopping:
+    if kill_at < math.inf:
         child.terminate()
     elif _wait_for_ports(name, child, host, ports):
         print(ready, flush=True)  # noqa: T201 (command-line program)
     stamp = _stamp(watched)
     while child.poll() is None:
-        try:
-            child.wait(_STOP_S if stopping else _POLL_S if watched else None)
-        except subprocess.TimeoutExpired:
-            previous, stamp = stamp, _stamp(watched)
-            if stopping or stamp != previous:
-                child.send_signal(signal.SIGKILL if stopping else signal.SIGHUP)
-    if stopping:
+        # A wait without a timeout would continue after the signal, for as long as the server ignores SIGTERM.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.wait(_POLL_S)
+        previous, stamp = stamp, _stamp(watched)
+        if time.monotonic() > kill_at:
+            child.kill()
+        elif stamp != previous:
+            child.send_signal(signal.SIGHUP)
+    if kill_at < math.inf:
         return 0
     _print_error(f"{name} exited with code {child.returncode}; see its output above")
     return ENDED
