@@ -13,7 +13,6 @@ def test_a_new_user_sees_the_first_steps(browser: Browser, machine: Machine) -> 
         assert_good_page(page, "sign-in")
 
         page.goto(machine.sign_in_link("newcomer"))
-        page.reload()  # the fragment alone loads nothing
         expect(page.get_by_test_id("signed-in")).to_be_visible()
         steps = page.get_by_test_id("first-steps")
         expect(steps).to_contain_text("Pair it")
