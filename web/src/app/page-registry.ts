@@ -44,13 +44,13 @@ export const PAGES = {
     part: "devices",
     link: texts.sections.devices,
     early: true,
-    load: async (): Loaded => (await import("../features/devices/list-page")).DeviceListPage,
+    load: async (): Loaded => (await import("./pages/device-list-page")).DeviceListPage,
   },
   device: {
     title: ({ id }: RouteParameters, fleet: Fleet): string => device(id, fleet),
     part: "devices",
     early: true,
-    load: async (): Loaded => (await import("../features/devices/robot-page")).DevicePage,
+    load: async (): Loaded => (await import("./pages/robot-page")).DevicePage,
   },
   keyframes: {
     title: texts.pages.keyframes,

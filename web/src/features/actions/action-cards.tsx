@@ -1,6 +1,7 @@
 /** Action cards of a robot: one for each capability in its description. */
 import { actionUnavailableReason } from "../devices";
-import type { DeviceSession, Fleet } from "../devices/model";
+import type { DeviceSession } from "../control/model";
+import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import type { ComponentChildren } from "preact";
 import type { KnownDescription } from "../../shared/mqtt/parse-messages";

@@ -1,3 +1,4 @@
-export { CommandTraceCard } from "./command-trace-card";
 export { ControlBar } from "./control-bar";
+export { useDeviceSessions } from "./device-sessions";
+export { DevicePageFrame } from "./page-frame";
 export { StopBanner } from "./stop-button";

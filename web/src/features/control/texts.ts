@@ -1,5 +1,3 @@
-import type { StepSource } from "../actions/model";
-import type { ObservedBy } from "./model/command-trace";
 import type { RequestOutcome } from "./model/control-request";
 
 export const texts = {
@@ -79,16 +77,5 @@ export const texts = {
     confirm: "Yes, reset",
     keep: "Keep stopped",
     resetting: "Resetting…",
-  },
-
-  trace: {
-    title: "Recent commands",
-    latency: "Latency",
-    none: "No commands sent from this page.",
-    command: "Command",
-    column: { accepted: "accepted", started: "started", observed: "observed", ended: "ended" },
-    source: { page: "by this page", device: "by the robot", cloud: "by the cloud" } satisfies Record<StepSource, string>,
-    observedBy: { motion: "motion", state: "reported state" } satisfies Record<ObservedBy, string>,
-    explained: "Time since the click, on this computer's clock. Observed: the first telemetry that shows motion.",
   },
 };

@@ -1,5 +1,4 @@
 /** Devices of one space: robots with details first, then room devices. */
-import { MultiRobotCheckbox } from "../steering";
 import { LastSeenAge, ReachChip } from "./reach-chip";
 import type { HealthSummary } from "../../shared/api/health";
 import type { DeviceStore } from "./model/device-store";
@@ -7,7 +6,9 @@ import type { Fleet } from "./model/device-list";
 import { isRoomDevice } from "./model/filter";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
+import { MultiRobotCheckbox } from "./selection";
 import { texts } from "./texts";
+import "./list.css";
 import { deviceAddress } from "../../shared/routing/routes";
 
 interface DeviceListsProps {

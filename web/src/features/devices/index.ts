@@ -1,7 +1,7 @@
 export { actionUnavailableReason, unavailableReason } from "./availability";
-export { DeviceLists } from "./device-list";
-export { useDeviceSessions } from "./device-sessions";
+export { DeviceLists, faultsOf } from "./device-list";
 export { EventLog } from "./event-log";
-export { DevicePageFrame } from "./page-frame";
 export { LastSeenAge, ReachChip } from "./reach-chip";
 export { RenameDevice } from "./rename";
+export { OperateSelected } from "./selection";
+export { texts as deviceTexts } from "./texts";

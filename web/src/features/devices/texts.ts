@@ -58,6 +58,14 @@ export const texts = {
     lastSeen: (age: string): string => `last seen ${age}`,
   },
 
+  /** Selection of robots that are operated on one page. */
+  selection: {
+    add: (label: string): string => `Select ${label} to operate several robots`,
+    count: (count: number): string => (count === 1 ? "1 robot selected. Select another one." : `${count} robots selected.`),
+    open: "Operate selected",
+    clear: "Clear selection",
+  },
+
   /** Why a device cannot be operated now. */
   unavailable: {
     viewer: "You are a viewer of this device. Ask its owner for operator access.",

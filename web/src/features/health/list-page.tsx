@@ -1,6 +1,7 @@
+import { DevicePageFrame } from "../control";
 /** Health of all devices, those of a space, or one. */
 import type { Account } from "../../shared/api/types";
-import { DevicePageFrame, LastSeenAge, ReachChip } from "../devices";
+import { LastSeenAge, ReachChip } from "../devices";
 import type { DeviceStore, Fleet } from "../devices/model";
 import { Age } from "../../shared/ui/age";
 import { Choice } from "../../shared/ui/choice";

@@ -1,7 +1,7 @@
 /** The keyframe editor of one device. */
 import type { Account } from "../../shared/api/types";
-import { ControlBar, StopBanner } from "../control";
-import { ReachChip, useDeviceSessions } from "../devices";
+import { ControlBar, StopBanner, useDeviceSessions } from "../control";
+import { ReachChip } from "../devices";
 import type { DeviceStore, Fleet } from "../devices/model";
 import type { Api } from "../../shared/api/client";
 import { common } from "../../shared/i18n/common";

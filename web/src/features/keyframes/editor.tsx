@@ -1,5 +1,5 @@
 /** The keyframe editor, with or without a robot. */
-import type { DeviceSession } from "../devices/model";
+import type { DeviceSession } from "../control/model";
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { newMovement, Drafts, Editor } from "./model/editor";

@@ -1,7 +1,7 @@
 /** Names a movement, saves it as a script and runs it on the robot. */
 import { RunStatusPanel } from "../actions";
 import { actionUnavailableReason } from "../devices";
-import type { DeviceSession } from "../devices/model";
+import type { DeviceSession } from "../control/model";
 import { Card } from "../../shared/ui/card";
 import { useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";

@@ -1,1 +1,1 @@
-export { LiveLatency } from "./live-latency-card";
+export { CommandTraceCard } from "./command-trace-card";

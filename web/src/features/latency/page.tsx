@@ -1,7 +1,8 @@
+import { DevicePageFrame } from "../control";
 /** Latency of all devices, or of one, which can be probed. */
 import type { Account } from "../../shared/api/types";
-import { DevicePageFrame } from "../devices";
-import type { DeviceSession, DeviceStore, Fleet } from "../devices/model";
+import type { DeviceSession } from "../control/model";
+import type { DeviceStore, Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { Choice } from "../../shared/ui/choice";
 import { PATHS, type Path, type StoredLatency, TRANSPORTS, type Transport } from "../../shared/api/latency";

@@ -1,3 +1,5 @@
+import type { StepSource } from "../actions/model";
+import type { ObservedBy } from "../control/model";
 import type { Path, Transport } from "../../shared/api/latency";
 import type { ProbeKind } from "./model/probe";
 
@@ -88,4 +90,15 @@ export const texts = {
   robotNote: "The robot's own latency is measured while you operate it: every command and every setpoint counts.",
   viewer: "Measurements by viewers are shown on this page only and are not stored.",
   ended: (reason: string): string => `The measurement ended early: ${reason}`,
+
+  trace: {
+    title: "Recent commands",
+    latency: "Latency",
+    none: "No commands sent from this page.",
+    command: "Command",
+    column: { accepted: "accepted", started: "started", observed: "observed", ended: "ended" },
+    source: { page: "by this page", device: "by the robot", cloud: "by the cloud" } satisfies Record<StepSource, string>,
+    observedBy: { motion: "motion", state: "reported state" } satisfies Record<ObservedBy, string>,
+    explained: "Time since the click, on this computer's clock. Observed: the first telemetry that shows motion.",
+  },
 };

@@ -1,7 +1,8 @@
+import { useDeviceSessions } from "../control";
 /** One movement: its script, errors, versions and runs. */
 import type { Account } from "../../shared/api/types";
-import { useDeviceSessions } from "../devices";
-import type { DeviceSession, Fleet } from "../devices/model";
+import type { DeviceSession } from "../control/model";
+import type { Fleet } from "../devices/model";
 import { readScript } from "../keyframes/model";
 import { Age } from "../../shared/ui/age";
 import { Card } from "../../shared/ui/card";

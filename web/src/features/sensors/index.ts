@@ -1,4 +1,11 @@
+import "./sensors.css";
+
+export { CameraCard } from "./camera-card";
 export { CameraSwitcher, useCameraSources } from "./camera-switcher";
+export { CapturesCard } from "./captures-card";
+export { DepthCard } from "./depth-card";
 export { HistoryCard, useRecording } from "./history-card";
-export { Figure, Limits, valueText } from "./readings-card";
-export { RoomDevicePage } from "./room-device-page";
+export { LidarCard } from "./lidar-card";
+export { CollectDataCard } from "./measure-card";
+export { Figure, Limits, ReadingsCard, valueText } from "./readings-card";
+export { SettingsCard } from "./settings-card";

@@ -1,5 +1,5 @@
 /** Manual steering of a robot in the modes that its description supports: joints, a frame, the base. */
-import type { DeviceSession } from "../devices/model";
+import type { DeviceSession } from "../control/model";
 import { Card } from "../../shared/ui/card";
 import { useId, useRef, useState } from "preact/hooks";
 import type { ComponentType } from "preact";

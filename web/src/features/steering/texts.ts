@@ -99,10 +99,6 @@ export const texts = {
 
   multiRobot: {
     title: (count: number): string => `${count} robots`,
-    pick: (label: string): string => `Select ${label} to operate several robots`,
-    picked: (count: number): string => (count === 1 ? "1 robot selected. Select another one." : `${count} robots selected.`),
-    open: "Operate selected",
-    none: "Clear selection",
     missing: "A device in this address does not exist, or you have no access to it.",
     stopAll: "Stop all",
     stopAllExplained: "The Escape key stops all robots on this page, regardless of the keyboard focus.",

@@ -1,3 +1,3 @@
 export { Fleet } from "./device-list";
-export { DeviceSession } from "./device-session";
 export { DeviceStore, type OpenRequest, type Reach } from "./device-store";
+export { type DeviceFilter, type KindFilter, matchesFilter, type OwnerFilter } from "./filter";

@@ -1,2 +1,3 @@
 export { type Quantity, quantityOf } from "./quantities";
+export { RoomDeviceAction } from "./room-device-action";
 export { Recording } from "./stored-series";

@@ -1,8 +1,9 @@
 /** Several robots on one page, each with its own control; one key and one button stop them all. */
 import type { Account } from "../../../shared/api/types";
-import { ControlBar, StopBanner } from "../../control";
-import { LastSeenAge, ReachChip, useDeviceSessions } from "../../devices";
-import type { DeviceSession, DeviceStore, Fleet } from "../../devices/model";
+import { ControlBar, StopBanner, useDeviceSessions } from "../../control";
+import { LastSeenAge, ReachChip } from "../../devices";
+import type { DeviceSession } from "../../control/model";
+import type { DeviceStore, Fleet } from "../../devices/model";
 import { TwinView } from "../../twin";
 import { useMemo, useState } from "preact/hooks";
 import type { Api } from "../../../shared/api/client";

@@ -1,9 +1,12 @@
 /** Operates one device from this page: control, Stop and actions. */
 import { ActionRunner } from "../../actions/model";
-import { CommandTrace, Control, StopSwitch, Watchers } from "../../control/model";
+import { CommandTrace } from "./command-trace";
+import { Control } from "./lease";
+import { StopSwitch } from "./stop";
+import { Watchers } from "./watchers";
 import { LatencySamples } from "../../latency/model";
 import type { Api } from "../../../shared/api/client";
-import type { DeviceStore } from "./device-store";
+import type { DeviceStore } from "../../devices/model";
 import type { Link } from "../../../shared/mqtt/mqtt-link";
 
 export class DeviceSession {

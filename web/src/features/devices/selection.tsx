@@ -1,8 +1,8 @@
 /** Selection of robots in the device list, to operate them on one page. */
-import type { DeviceStore } from "../../devices/model";
+import type { DeviceStore } from "./model";
 import { signal } from "@preact/signals";
-import { texts } from "../texts";
-import { multiRobotAddress } from "../../../shared/routing/routes";
+import { texts } from "./texts";
+import { multiRobotAddress } from "../../shared/routing/routes";
 
 const selectedIds = signal<readonly string[]>([]);
 
@@ -13,7 +13,7 @@ export function MultiRobotCheckbox({ device }: { device: DeviceStore }) {
       type="checkbox"
       class="pick"
       data-testid="pick"
-      aria-label={texts.multiRobot.pick(device.info.value.label)}
+      aria-label={texts.selection.add(device.info.value.label)}
       checked={selectedIds.value.includes(id)}
       onChange={(event) => {
         const others = selectedIds.value.filter((each) => each !== id);
@@ -30,14 +30,14 @@ export function OperateSelected({ devices }: { devices: readonly DeviceStore[] }
     <div role="status">
       {ids.length > 0 && (
         <p class="row together-offer">
-          {texts.multiRobot.picked(ids.length)}
+          {texts.selection.count(ids.length)}
           {ids.length > 1 && (
             <a class="elsewhere" href={multiRobotAddress(ids)} data-testid="operate-together">
-              {texts.multiRobot.open}
+              {texts.selection.open}
             </a>
           )}
           <button type="button" class="plain" onClick={() => (selectedIds.value = [])}>
-            {texts.multiRobot.none}
+            {texts.selection.clear}
           </button>
         </p>
       )}

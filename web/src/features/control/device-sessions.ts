@@ -2,8 +2,7 @@
 import type { Account } from "../../shared/api/types";
 import { useEffect, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import type { DeviceStore } from "./model/device-store";
-import type { Fleet } from "./model/device-list";
+import type { DeviceStore, Fleet } from "../devices/model";
 import { DeviceSession } from "./model/device-session";
 
 /** One session per device, in order; none before the page is mounted. One key stops all of them. */

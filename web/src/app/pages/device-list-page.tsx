@@ -1,16 +1,11 @@
-import { FirstSteps } from "../help";
-import { SpaceList } from "../spaces";
-import { OperateSelected } from "../steering";
+import { DeviceLists, deviceTexts as texts, faultsOf, OperateSelected } from "../../features/devices";
+import { type DeviceFilter, type DeviceStore, type Fleet, type KindFilter, matchesFilter, type OwnerFilter } from "../../features/devices/model";
+import { FirstSteps } from "../../features/help";
+import { SpaceList } from "../../features/spaces";
 import { Choice } from "../../shared/ui/choice";
 import { useMemo, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import type { DeviceStore } from "./model/device-store";
-import type { Fleet } from "./model/device-list";
-import { matchesFilter, type KindFilter, type DeviceFilter, type OwnerFilter } from "./model/filter";
 import { common } from "../../shared/i18n/common";
-import { texts } from "./texts";
-import { DeviceLists, faultsOf } from "./device-list";
-import "./list.css";
 import { usePolling } from "../../shared/hooks/use-polling";
 import { pairAddress, spaceAddress } from "../../shared/routing/routes";
 

@@ -1,14 +1,13 @@
 /** The frame of a device's secondary pages: name, control, Stop and links to its other pages. */
 import type { Account } from "../../shared/api/types";
-import { ControlBar, StopBanner } from "../control";
-import { LastSeenAge, ReachChip } from "./reach-chip";
+import { ControlBar } from "./control-bar";
+import { deviceTexts as texts, LastSeenAge, ReachChip } from "../devices";
+import type { DeviceStore, Fleet } from "../devices/model";
+import { StopBanner } from "./stop-button";
 import type { ComponentChildren } from "preact";
 import type { Api } from "../../shared/api/client";
-import type { DeviceStore } from "./model/device-store";
-import type { Fleet } from "./model/device-list";
 import type { DeviceSession } from "./model/device-session";
 import { common } from "../../shared/i18n/common";
-import { texts } from "./texts";
 import { deviceAddress, deviceListAddress, healthAddressOf, latencyAddressOf } from "../../shared/routing/routes";
 import { useDeviceSessions } from "./device-sessions";
 import "./page-frame.css";

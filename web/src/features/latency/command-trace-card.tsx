@@ -1,12 +1,12 @@
 /** Latency and the trace of the last commands, from measurements only. */
 import { actionTexts, describeRequest } from "../actions";
 import type { Step } from "../actions/model";
-import type { DeviceSession } from "../devices/model";
-import { LiveLatency } from "../latency";
+import type { DeviceSession } from "../control/model";
+import { LiveLatency } from "./live-latency-card";
 import { steeringTexts } from "../steering";
 import { Card } from "../../shared/ui/card";
 import { clock } from "../../shared/lib/clock";
-import type { TraceLine, TraceStatus } from "./model/command-trace";
+import type { TraceLine, TraceStatus } from "../control/model";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 

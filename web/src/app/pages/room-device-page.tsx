@@ -1,21 +1,15 @@
 /** The page of a room device: one card for each capability in its description. */
-import { EventLog } from "../devices";
-import type { DeviceSession, Fleet } from "../devices/model";
-import { FloorPlan } from "../spaces";
+import { EventLog } from "../../features/devices";
+import type { DeviceSession } from "../../features/control/model";
+import type { Fleet } from "../../features/devices/model";
+import { FloorPlan } from "../../features/spaces";
 import { useComputed, useSignalEffect } from "@preact/signals";
 import type { ComponentChildren } from "preact";
 import { useEffect, useMemo } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
-import { RoomDeviceAction } from "./model/room-device-action";
+import { CameraCard, CapturesCard, CollectDataCard, DepthCard, LidarCard, ReadingsCard, SettingsCard } from "../../features/sensors";
+import { RoomDeviceAction } from "../../features/sensors/model";
 import type { KnownDescription } from "../../shared/mqtt/parse-messages";
-import { CameraCard } from "./camera-card";
-import { DepthCard } from "./depth-card";
-import { CapturesCard } from "./captures-card";
-import { CollectDataCard } from "./measure-card";
-import { ReadingsCard } from "./readings-card";
-import { LidarCard } from "./lidar-card";
-import { SettingsCard } from "./settings-card";
-import "./sensors.css";
 
 /** A capture with its own card. */
 const IMAGE = "image";
