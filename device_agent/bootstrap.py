@@ -216,7 +216,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
     journal = Journal(store.journal)
     journal.open(now_ms=wall_ms())
     journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
-    pins = PinnedKeys(pairing, save=store.save_pairing, now_ms=clock.now_ms)
+    pins = PinnedKeys(pairing, identity=store.private_key(), save=store.save_pairing, now_ms=clock.now_ms)
     monitor = PairingMonitor(pairing, configuration, enrolled_devices(configuration), pins)
     readings = ReadingCache(
         space=pairing.space,

@@ -1,9 +1,10 @@
 """Move one joint with streamed setpoints. Usage: ``python examples/stream_setpoints.py DEVICE JOINT POSITION_RAD``.
 
-Takes the lease, streams setpoints that echo the newest telemetry tick, and releases the lease. The robot stops
-automatically 300 ms after the last setpoint.
+Takes the lease, streams authenticated setpoints that echo the newest telemetry tick, and releases the lease. The robot
+stops automatically 300 ms after the last setpoint.
 """
 
+import hmac
 import json
 import queue
 import sys
@@ -26,6 +27,17 @@ watcher.on_connect = lambda *_: watcher.subscribe([(topic(device, "desc"), 1), (
 watcher.loop_start()
 control = connect_to_broker({"purpose": "control", "device": device["id"], "epoch": lease["epoch"]})
 control.loop_start()
+
+ctl = topic(device, f"ctl/{lease['epoch']}")
+
+
+def seal(setpoint: dict[str, object]) -> str:
+    """Authenticate a setpoint with the key of the lease."""
+    body = json.dumps(setpoint)
+    text = f"telescope/v1/setpoint\n{ctl}\n{body}"
+    tag = hmac.new(bytes.fromhex(lease["setpoint_key"]), text.encode(), "sha256").hexdigest()[:32]
+    return f'{{"tag":"{tag}","body":{body}}}'
+
 
 joints: list[str] = []
 sequence = 0
@@ -51,7 +63,7 @@ try:
             "sent_ms": time.time() * 1000,
             "target": {"kind": "joints", "position_rad": {joint: target_rad}},
         }
-        control.publish(topic(device, f"ctl/{lease['epoch']}"), json.dumps(setpoint), qos=0)
+        control.publish(ctl, seal(setpoint), qos=0)
         time.sleep(PERIOD_S)
 finally:
     call("DELETE", f"/devices/{device['id']}/lease?epoch={lease['epoch']}")

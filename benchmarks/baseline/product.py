@@ -20,6 +20,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from benchmarks.baseline.echo_servers import HOST, disable_nagle
 from device_agent.protocol import JointTarget, Setpoint, codec
 from device_agent.protocol.manifests import robot_type
+from device_agent.protocol.security import setpoints
 from device_agent.protocol.security.grants import Grant
 from function_app import settings
 from tests.harness.browser.product import Api, Machine, start_machine
@@ -169,6 +170,7 @@ class StreamingOperator:
         lease = product.api.post(self._path, {"lease_ms": LEASE_MS, "wait_ms": 5000})
         self.epoch: int = lease["epoch"]
         self._topic = f"{topic}/ctl/{self.epoch}"
+        self._key = bytes.fromhex(lease["setpoint_key"])
         self._renewal = threading.Thread(target=self._renew, daemon=True)
         self._renewal.start()
         with self._telemetry_changed:
@@ -193,7 +195,7 @@ class StreamingOperator:
                 sent_ms=time.monotonic() * 1000,
                 target=JointTarget(position_rad=self.target_rad),
             )
-            self.sent = codec.encode(setpoint)
+            self.sent = setpoints.seal(codec.encode(setpoint), self._key, self._topic)
             started_s = time.perf_counter()
             self.mqtt.client.publish(self._topic, self.sent)
             if not self._telemetry_changed.wait_for(self._applied, TIMEOUT_S):

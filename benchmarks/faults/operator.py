@@ -8,6 +8,7 @@ from typing import Final, Self
 from benchmarks.baseline.product import LEASE_MS, TIMEOUT_S
 from benchmarks.faults.processes import STREAMING_ARM, ProductProcesses
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec
+from device_agent.protocol.security import setpoints
 from tests.harness.network.brokers import wait_until
 
 JOINTS: Final = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -42,6 +43,8 @@ class FaultOperator:
         product = self._product
         lease = product.post(f"{product.device(STREAMING_ARM)}/lease", lease_ms=LEASE_MS, wait_ms=5000)
         self.epoch = lease["epoch"]
+        self._key = bytes.fromhex(lease["setpoint_key"])
+        self._topic = f"{product.topic(STREAMING_ARM)}/ctl/{self.epoch}"
         viewer = self._stack.enter_context(
             product.issued({"purpose": "view"}, f"{product.topic(STREAMING_ARM)}/tele/joints")
         )
@@ -90,14 +93,14 @@ class FaultOperator:
                 sent_ms=time.monotonic() * 1000,
                 target=JointTarget(position_rad=target),
             )
-            pending = self._send([*pending, codec.encode(setpoint)])
+            pending = self._send([*pending, setpoints.seal(codec.encode(setpoint), self._key, self._topic)])
 
     def _send(self, pending: list[bytes]) -> list[bytes]:
         """Sends the payloads and returns those to send with the next setpoint."""
         if self._shuffled and len(pending) < 2:  # noqa: PLR2004 (a pair)
             return pending
         for payload in [*reversed(pending), *pending] if self._shuffled else pending:
-            self._control.client.publish(f"{self._product.topic(STREAMING_ARM)}/ctl/{self.epoch}", payload)
+            self._control.client.publish(self._topic, payload)
         return []
 
     def await_motion(self) -> None:

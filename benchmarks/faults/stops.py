@@ -77,8 +77,8 @@ class StopRuns:
 
     def _send(self) -> None:
         self._number += 1
-        stop = Stop(id=f"bench{self._number}", caller="bench")
-        self._client.client.publish(f"{self._product.topic(STREAMING_ARM)}/stop", codec.encode(stop), 1)
+        stop = Stop(id=f"bench{self._number}")
+        self._client.client.publish(f"{self._product.topic(STREAMING_ARM)}/stop/bench", codec.encode(stop), 1)
 
     def _call(self) -> None:
         self._product.post(f"{self._product.device(STREAMING_ARM)}/stop", reason="bench")

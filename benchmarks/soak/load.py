@@ -13,6 +13,7 @@ import httpx
 from benchmarks.baseline.product import LEASE_MS, TIMEOUT_S, MeasuredProduct, MqttClient
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec
 from device_agent.protocol.manifests import robot_type
+from device_agent.protocol.security import setpoints
 from tests.harness.browser.product import Api
 from tests.harness.paths import ROOT
 
@@ -137,7 +138,7 @@ class Load:
             control = {"purpose": "control", "device": device["id"], "epoch": epoch}
             viewer = self._connected(http, {"purpose": "view"}, f"{device['topic']}/tele/joints")
             with viewer as telemetry, self._connected(http, control) as client:
-                self._stream(http, lease, StreamedArm(device, epoch, telemetry, client))
+                self._stream(http, lease, StreamedArm(device, granted, telemetry, client))
         finally:
             self._request(http, "DELETE", lease, epoch=epoch)
         self.count("leases acquired and released")
@@ -231,15 +232,18 @@ class Load:
 class StreamedArm:
     """The arm under one lease with slow motion of one wrist."""
 
-    def __init__(self, device: dict[str, Any], epoch: int, telemetry: MqttClient, control: MqttClient) -> None:
+    def __init__(
+        self, device: dict[str, Any], lease: dict[str, Any], telemetry: MqttClient, control: MqttClient
+    ) -> None:
         joints = robot_type.load(ROOT / "robots" / device["robot_type"]).joints
         self._names = [each.name for each in joints]
-        self._topic = f"{device['topic']}/ctl/{epoch}"
+        self.epoch: int = lease["epoch"]
+        self._topic = f"{device['topic']}/ctl/{self.epoch}"
+        self._key = bytes.fromhex(lease["setpoint_key"])
         self._control = control
         self._newest = codec.decode(telemetry.received.get(timeout=TIMEOUT_S), JointTelemetry)
         self._started_s = time.monotonic()
         self._home_rad = list(self._newest.commanded_rad)
-        self.epoch = epoch
         self.sequence = 0
         telemetry.on_payload = self._on_telemetry
 
@@ -258,7 +262,7 @@ class StreamedArm:
             sent_ms=now_s * 1000,
             target=JointTarget(position_rad=target),
         )
-        self._control.client.publish(self._topic, codec.encode(setpoint))
+        self._control.client.publish(self._topic, setpoints.seal(codec.encode(setpoint), self._key, self._topic))
 
     def applied(self) -> bool:
         """Returns True if one of the last setpoints was applied."""

@@ -4,6 +4,8 @@ import asyncio
 import time
 from concurrent.futures import Executor
 
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
 from device_agent.config.identity_store import Pairing
 from device_agent.load_generator.connection import Connection, ProtocolVersion, VersionRejected
 from device_agent.load_generator.kinematic_arm import ArmType
@@ -32,6 +34,7 @@ class LoadAgent:
         pairing: Pairing,
         arm_type: ArmType,
         *,
+        identity: Ed25519PrivateKey,
         clock: CloudClock,
         version: ProtocolVersion,
         metrics: Metrics,
@@ -49,7 +52,7 @@ class LoadAgent:
         self._robot = SimulatedRobot(
             (pairing.space, pairing.agent),
             arm_type,
-            keys=PinnedKeys(pairing, save=lambda _: None, now_ms=clock.now_ms),
+            keys=PinnedKeys(pairing, identity=identity, save=lambda _: None, now_ms=clock.now_ms),
             cloud_ms=clock.now_ms,
             publish=self._publish,
             now_s=time.monotonic(),

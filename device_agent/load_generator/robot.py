@@ -41,7 +41,8 @@ from device_agent.protocol import (
     topics,
 )
 from device_agent.protocol.errors import ProtocolError, SignatureError
-from device_agent.protocol.security import signing
+from device_agent.protocol.fields import printable
+from device_agent.protocol.security import setpoints, signing
 from device_agent.runtime.authority.authority import Authority, Reservation
 from device_agent.runtime.authority.control_request import PendingControlRequest
 from device_agent.runtime.authority.event_recorder import EventRecord, event_message
@@ -239,10 +240,11 @@ class SimulatedRobot:
             elif parsed.kind == topics.CMD:
                 self._process(payload)
             elif parsed.kind == topics.CTL:
-                self._accept_setpoint(parsed.name, codec.decode(payload, Setpoint))
+                self._accept_setpoint(parsed.name, topic, payload)
             elif parsed.kind == topics.STOP:
                 stop = codec.decode(payload, Stop)
-                self._authority.stop(StopLatch(caller=stop.caller, reason=stop.reason, at_ms=wall_ms()))
+                caller = f"{parsed.name} (unverified)"
+                self._authority.stop(StopLatch(caller=caller, reason=printable(stop.reason[:2000]), at_ms=wall_ms()))
         except (ProtocolError, SignatureError, Refused):
             self.refused += 1
 
@@ -251,10 +253,13 @@ class SimulatedRobot:
         self._arm.advance(now_s)
         self._authority.expire(now_s)
 
-    def _accept_setpoint(self, epoch: str, setpoint: Setpoint) -> None:
+    def _accept_setpoint(self, epoch: str, topic: str, payload: bytes) -> None:
         lease = self._authority.lease(self._now_s)
-        if lease is None or setpoint.epoch != lease.epoch or epoch != str(lease.epoch):
+        if lease is None or epoch != str(lease.epoch):
             raise Refused("no_lease", "this lease is not in force")
+        setpoint = codec.decode(setpoints.open_sealed(payload, lease.keys, topic), Setpoint)
+        if setpoint.epoch != lease.epoch:
+            raise Refused("no_lease", "the epochs in the topic and in the message differ")
         previous = self._setpoint
         if previous is not None and previous.epoch == setpoint.epoch and setpoint.sequence <= previous.sequence:
             raise Refused("out_of_order", "a newer setpoint has already arrived")
@@ -305,9 +310,15 @@ class SimulatedRobot:
             case MoveJoints() as move:
                 self._start(command, move)
                 return
-            case GrantLease(holder=holder, lease_ms=lease_ms, reason=reason):
+            case GrantLease(holder=holder, lease_ms=lease_ms, reason=reason, pairing=pairing):
+                topic = topics.device(*self._address, topics.CTL, str(command.epoch))
                 self._authority.grant(
-                    epoch=command.epoch, holder=holder, lease_s=lease_ms / 1000, now_s=self._now_s, reason=reason
+                    epoch=command.epoch,
+                    holder=holder,
+                    lease_s=lease_ms / 1000,
+                    now_s=self._now_s,
+                    reason=printable(reason),
+                    keys=self._keys.setpoint_keys(topic, pairing),
                 )
             case ReleaseLease():
                 self._authority.release(command.epoch)
@@ -317,7 +328,8 @@ class SimulatedRobot:
             case WithdrawRequest(request=request_id):
                 self._control_request.withdraw(request_id)
             case StopDevice(reason=reason):
-                self._authority.stop(StopLatch(caller=command.caller, reason=reason, at_ms=wall_ms()))
+                latch = StopLatch(caller=command.caller, reason=printable(reason), at_ms=wall_ms(), verified=True)
+                self._authority.stop(latch)
             case ResetStop():
                 self._authority.fence(command.epoch)
                 self._authority.reset_stop()

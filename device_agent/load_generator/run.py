@@ -59,6 +59,7 @@ def run(options: LoadOptions) -> int:
                     version=version,
                     metrics=metrics,
                     pool=pool,
+                    identity=key,
                 )
                 for key, pairing in zip(keys, pairings, strict=True)
             ]

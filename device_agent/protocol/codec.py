@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.fields import printable
 
 MAX_BYTES = 128 * 1024
 """Maximum message size of AWS IoT Core."""
@@ -50,7 +51,7 @@ def decode(payload: bytes, kind: type[T]) -> T:
     try:
         message: T = decoder.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ProtocolError(f"not a valid {getattr(kind, '__name__', 'message')}: {error}") from error
+        raise ProtocolError(printable(f"not a valid {getattr(kind, '__name__', 'message')}: {error}")) from error
     return message
 
 

@@ -21,12 +21,17 @@ class _Request(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, ta
 class GrantLease(_Request, frozen=True, kw_only=True, tag="grant_lease"):
     """``holder`` has control for ``lease_ms`` from the time of arrival. Also renews a lease.
 
-    ``reason``: why control was taken from another operator; shown to that operator.
+    Attributes:
+        holder: Name of the operator.
+        lease_ms: Duration from arrival [ms].
+        reason: Why control was taken from another operator; shown to that operator.
+        pairing: Id of the pairing. The key of the lease's setpoints depends on it (``security.setpoints``).
     """
 
     holder: Label
     lease_ms: Annotated[int, Meta(ge=1, le=3_600_000)]
     reason: Text = ""
+    pairing: Label = ""
 
 
 class ReleaseLease(_Request, frozen=True, kw_only=True, tag="release_lease"):
@@ -288,7 +293,7 @@ class DriveTarget(_Request, frozen=True, kw_only=True, tag="drive"):
 
 
 class Setpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``ctl/{epoch}``: one streamed setpoint. The newest is used; ``sequence`` starts at 1 in each lease.
+    """One streamed setpoint; the body of ``setpoints.Tagged``. The newest is used; ``sequence`` rises in each lease.
 
     Attributes:
         echo_tick_ms: ``tick_ms`` of the newest telemetry that the operator has received. Its age on the robot's own
@@ -303,9 +308,12 @@ class Setpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     target: JointTarget | JogTarget | DriveTarget
 
 
-class Stop(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``stop``: latch Stop now. Needs no lease and no signature; the broker restricts the publishers."""
+class Stop(Struct, frozen=True, kw_only=True):
+    """``stop/{author}``: latch Stop now. Needs no lease and no signature, and unknown fields do not prevent it.
+
+    The last topic level is the author's account; the broker allows each account only its own. The device shows this
+    author as unverified until the signed ``stop_device`` command arrives.
+    """
 
     id: Id
-    caller: Label
-    reason: Text = ""
+    reason: str = ""

@@ -1,5 +1,6 @@
 """Field types of messages, manifests and script calls."""
 
+import re
 from typing import Annotated
 
 from msgspec import Meta
@@ -8,7 +9,16 @@ from device_agent.protocol.topics import ID_PATTERN
 
 Id = Annotated[str, Meta(pattern=f"^{ID_PATTERN}$", description="letters, digits, _ and -, 1 to 64 of them")]
 Text = Annotated[str, Meta(max_length=2000)]
-Label = Annotated[str, Meta(max_length=200)]
+UNPRINTABLE = (
+    r"\u0000-\u001f\u007f-\u009f\u00ad\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u180e\u200b-\u200f"
+    r"\u2028-\u202e\u2060-\u2064\u2066-\u206f\ufeff\ufff9-\ufffb"
+    "\U000110bd\U000110cd\U00013430-\U0001343f\U0001bca0-\U0001bca3\U0001d173-\U0001d17a\U000e0001\U000e0020-\U000e007f"
+)
+"""Characters that a label must not contain: Unicode categories Cc, Cf, Zl and Zp. They change how text is displayed."""
+Label = Annotated[
+    str, Meta(max_length=200, pattern=f"^[^{UNPRINTABLE}]*$", description="no control and format characters")
+]
+_UNPRINTABLE = re.compile(f"[{UNPRINTABLE}]")
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Milliseconds = Annotated[int, Meta(ge=0, le=2**53)]
 FIELD_PATTERN = r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,79}"
@@ -27,3 +37,8 @@ JointPositions = Annotated[
     dict[str, float],
     Meta(min_length=1, max_length=128, description="joint name → position [rad]; other joints keep their target"),
 ]
+
+
+def printable(text: str) -> str:
+    """The text with each control or format character replaced by U+FFFD, as a label requires."""
+    return _UNPRINTABLE.sub("\ufffd", text)

@@ -31,11 +31,15 @@ class Mode(StrEnum):
 
 
 class StopLatch(Struct, frozen=True, kw_only=True):
-    """Who stopped the device, and when. It stays until an authorized caller resets it."""
+    """Who stopped the device, and when. It stays until an authorized caller resets it.
+
+    ``verified``: a signed command names the caller. Otherwise only the broker vouches for the account.
+    """
 
     caller: Label
     reason: Text
     at_ms: Milliseconds
+    verified: bool = False
 
 
 class OpenRequest(Struct, frozen=True, kw_only=True):

@@ -29,7 +29,10 @@ CLASSES = frozenset({DESC, STATE, TELE, LATE, CAM, EVENT, CMD, ACK, CTL, STOP})
 MEASURED = frozenset({TELE, LATE})
 """Classes that carry measurements: live, and delayed by a disconnection."""
 _NAME_REQUIRED = frozenset({TELE, LATE, CAM, CTL})
-_NAME_ALLOWED = _NAME_REQUIRED | {DESC}
+_NAME_ALLOWED = _NAME_REQUIRED | {DESC, STOP}
+RETAINED = frozenset({CONN, DESC, STATE})
+"""Classes that brokers retain. A retained message of any other class is rejected."""
+_CLASS_LEVEL = 5
 ANY = "+"
 
 JOINTS = "joints"
@@ -66,7 +69,8 @@ def device(space: str, agent: str, name: str, kind: str, stream: str = "") -> st
         agent: Id of the agent, or ``+`` in a filter.
         name: Name of the device at its agent, or ``+`` in a filter.
         kind: One of ``CLASSES``.
-        stream: Last level, for classes that have one: a stream, a camera or the epoch of a lease.
+        stream: Last level, for classes that have one: a stream, a camera, the epoch of a lease, or the account that
+            stops the device.
     """
     base = f"{ROOT}/{space}/{agent}/{name}/{kind}"
     return f"{base}/{stream}" if stream else base
@@ -88,7 +92,14 @@ def parse(topic: str) -> Topic:
                 return Topic(space, agent, name, kind)
             case [space, agent, name, kind, stream] if kind in _NAME_ALLOWED:
                 return Topic(space, agent, name, kind, stream)
-    raise ProtocolError(f"'{topic[:200]}' is not a topic of {ROOT}")
+    raise ProtocolError(f"{topic[:200]!r} is not a topic of {ROOT}")
+
+
+def may_retain(pattern: str) -> bool:
+    """Whether a retained message is allowed on a topic, or on the topics of a filter; topics outside ``ROOT`` too."""
+    levels = pattern.split("/")
+    kind = levels[_CLASS_LEVEL] if len(levels) > _CLASS_LEVEL else levels[-1]
+    return not pattern.startswith(f"{ROOT}/") or kind in RETAINED
 
 
 def matches(pattern: str, topic: str) -> bool:

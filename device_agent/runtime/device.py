@@ -19,9 +19,11 @@ from device_agent.ports.skills import Skills
 from device_agent.ports.speech import Speech
 from device_agent.ports.uploads import Uploads
 from device_agent.protocol import JointTelemetry, Measurements, Setpoint, Stop, StopLatch, codec, topics
-from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.events import EventKind
+from device_agent.protocol.fields import printable
 from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.protocol.security import setpoints
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.executor import ActionExecutor
 from device_agent.runtime.actions.script_policy import ScriptPolicy
@@ -49,6 +51,7 @@ _REJECTED = {
     topics.CMD: EventKind.COMMAND_REJECTED,
 }
 _SCRIPTS = {"unavailable": EventKind.SCRIPTS_UNAVAILABLE, "unconfined": EventKind.SCRIPTS_UNCONFINED}
+MAX_REASON = 2000
 _log = logging.getLogger(__name__)
 
 
@@ -224,16 +227,15 @@ class Device:
         """Handle one message; quick, and never raises."""
         try:
             if topic.kind == topics.CTL:
-                self._accept_setpoint(topic.name, payload)
+                self._accept_setpoint(topic, payload)
             elif topic.kind == topics.STOP:
-                stop = codec.decode(payload, Stop)
-                self._controller.stop(StopLatch(caller=stop.caller, reason=stop.reason, at_ms=wall_ms()))
-                self._wake()
-                _log.warning("%s: stopped by %s", self.name, stop.caller)
+                self._stop(topic.name, codec.decode(payload, Stop))
             elif topic.kind == topics.CMD:
                 self._commands.submit(payload)
         except Refused as refused:
             self._reject(topic.kind, refused.code, refused.message)
+        except SignatureError as error:
+            self._reject(topic.kind, "bad_signature", str(error))
         except ProtocolError as error:
             _log.warning("%s: %s rejected: %s", self.name, topic.kind, str(error)[:300])
             self._reject(topic.kind, "malformed", str(error)[:300])
@@ -243,11 +245,22 @@ class Device:
         event = EventRecord(_REJECTED[topic_kind], message, "warning", {"code": code})
         self._events.record_rejection(event, code=code, now_s=time.monotonic())
 
-    def _accept_setpoint(self, epoch: str, payload: bytes) -> None:
-        setpoint = codec.decode(payload, Setpoint)
-        if epoch != str(setpoint.epoch):
-            raise Refused("no_lease", "the epochs in the topic and in the message differ")
-        self._controller.accept_setpoint(setpoint, now_s=time.monotonic(), tick_ms=tick_ms())
+    def _stop(self, author: str, stop: Stop) -> None:
+        """Latch Stop. Only the broker vouches for the author, so it is shown as unverified."""
+        caller = f"{author} (unverified)" if author else "unknown (unverified)"
+        reason = printable(stop.reason[:MAX_REASON])
+        self._controller.stop(StopLatch(caller=caller, reason=reason, at_ms=wall_ms()))
+        self._wake()
+        _log.warning("%s: stopped by %s", self.name, caller)
+
+    def _accept_setpoint(self, topic: topics.Topic, payload: bytes) -> None:
+        now_s = time.monotonic()
+        lease = self._controller.lease(now_s)
+        if lease is None or topic.name != str(lease.epoch):
+            raise Refused("no_lease", f"lease {topic.name} is not in force")
+        address = topics.device(*topic)
+        setpoint = codec.decode(setpoints.open_sealed(payload, lease.keys, address), Setpoint)
+        self._controller.accept_setpoint(setpoint, now_s=now_s, tick_ms=tick_ms())
         self._wake()
 
     def _wake(self) -> None:

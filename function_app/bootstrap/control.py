@@ -39,6 +39,7 @@ class ControlServices(MessagingServices):
             revocation=self.revocation,
             command_sender=self.command_sender,
             control_events=self.control_events,
+            keys=self.keys,
             clock=self.clock,
         )
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from amqtt.mqtt.packet import CONNECT, DISCONNECT, PINGREQ, PUBACK, PUBLISH, SUBSCRIBE, UNSUBSCRIBE
 
+from device_agent.protocol import topics
 from device_agent.protocol.security import revocation
 from device_agent.protocol.security.grants import Grant
 from infra.embedded_broker import packets
@@ -198,6 +199,8 @@ class Connection:
             return
         if not valid_topic(will.topic, self._limits.topic_bytes) or not grant.may_publish(will.topic):
             raise Refused(packets.NOT_AUTHORISED, "the grant does not permit the topic of the will")
+        if will.retain and not topics.may_retain(will.topic):
+            raise Refused(packets.NOT_AUTHORISED, "the will is retained, but messages of its class are not")
         if len(will.payload) > (self._limits.retained_bytes if will.retain else self._limits.payload_bytes):
             raise Refused(packets.NOT_AUTHORISED, "the will is too long")
 
@@ -211,6 +214,8 @@ class Connection:
             self.close(f"published {len(message.payload)} bytes retained; the maximum is {self._limits.retained_bytes}")
         elif topic not in self._publishable and not self._may_publish(topic):
             self.close(f"published to {topic[:200]!r}, which its grant does not permit")
+        elif message.retain and not topics.may_retain(topic):
+            self.close(f"published retained to {topic[:200]!r}; messages of this class are not retained")
         elif topic == revocation.TOPIC:
             self._handle_control(message)
         elif not self._broker.publish(

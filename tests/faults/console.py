@@ -23,6 +23,7 @@ import requests
 from paho.mqtt.enums import CallbackAPIVersion
 
 from device_agent.protocol import JointTarget, JointTelemetry, Mode, Setpoint, State, codec
+from device_agent.protocol.security import setpoints
 
 PERIOD_S = 0.025
 FRESH_S = 0.2
@@ -139,6 +140,7 @@ class Operator:
         self._renew_s = 0.0
         self._sweeping = False
         self._motion_reported = True
+        self._key = b""
         self._sequence = 0
         self._target_rad: list[float] = []
         self._sent_s = 0.0
@@ -177,6 +179,7 @@ class Operator:
             self._report(rejected=str(error)[:200])
             return
         epoch = self.epoch = granted["epoch"]
+        self._key = bytes.fromhex(granted["setpoint_key"])
         self._confirmed, self._sequence, self._sweeping = False, 0, False
         self._renewed(granted, requested_s)
         self._link = Link(
@@ -229,9 +232,9 @@ class Operator:
         setpoint = Setpoint(
             epoch=self.epoch, sequence=self._sequence, echo_tick_ms=message.tick_ms, sent_ms=now_s * 1000, target=target
         )
-        if self._link is not None and self._link.publish(
-            f"{self.config.topic}/ctl/{self.epoch}", codec.encode(setpoint)
-        ):
+        topic = f"{self.config.topic}/ctl/{self.epoch}"
+        sealed = setpoints.seal(codec.encode(setpoint), self._key, topic)
+        if self._link is not None and self._link.publish(topic, sealed):
             self._sent_s = now_s
         elif now_s - self._sent_s > ABANDON_S:
             self._end("no-connection")

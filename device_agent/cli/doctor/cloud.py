@@ -56,7 +56,7 @@ def examine(store: IdentityStore, configuration: AgentConfig) -> Iterator[Findin
         yield warning("pairing", "the agent was moved to another space", "No action is needed: `run` detects it.")
         return
     yield ok("pairing", f"paired with {pairing.account}")
-    yield _keys(enrollment, pairing, clock)
+    yield _keys(store, enrollment, pairing, clock)
     yield from _link(store, configuration, pairing, clock)
 
 
@@ -120,11 +120,11 @@ def _server(
     return enrollment
 
 
-def _keys(enrollment: dict[str, Any], pairing: Pairing, clock: CloudClock) -> Finding:
+def _keys(store: IdentityStore, enrollment: dict[str, Any], pairing: Pairing, clock: CloudClock) -> Finding:
     """Check that this agent trusts the key with which the cloud signs now."""
     try:
         keys = responses.read(enrollment, responses.KeyUpdate)
-        pins = PinnedKeys(pairing, save=lambda _: None, now_ms=clock.now_ms)
+        pins = PinnedKeys(pairing, identity=store.private_key(), save=lambda _: None, now_ms=clock.now_ms)
         pins.follow(keys.key_statements)
     except (CloudError, Refused) as error:
         return problem("keys", f"the cloud's new key is not trusted: {error}", f"Then {ADVICE}.")
@@ -173,7 +173,7 @@ def _connect(
 ) -> Iterator[Finding]:
     journal = Journal(store.journal)
     journal.open(now_ms=wall_ms())
-    pins = PinnedKeys(pairing, save=store.save_pairing, now_ms=clock.now_ms)
+    pins = PinnedKeys(pairing, identity=store.private_key(), save=store.save_pairing, now_ms=clock.now_ms)
     monitor = pairing_monitor.PairingMonitor(pairing, configuration, catalogue.enrolled_devices(configuration), pins)
     transport = factory.make(
         factory.Wiring(

@@ -71,15 +71,15 @@ _CHANNELS = (
     _Channel(
         "setpoint",
         f"{_DEVICE}/ctl/{{epoch}}",
-        "Setpoint",
+        "Tagged",
         0,
         False,
-        "A streamed setpoint; the newest wins.",
+        "An authenticated setpoint; `body` is a Setpoint. The newest wins.",
         to_agent=True,
     ),
     _Channel(
         "stop",
-        f"{_DEVICE}/stop",
+        f"{_DEVICE}/stop/{{author}}",
         "Stop",
         1,
         False,
@@ -94,6 +94,7 @@ _PARAMETERS = {
     "camera": "Name of the camera.",
     "stream": "Name of the stream, except `joints`.",
     "epoch": "Epoch of the lease under which the setpoints are sent.",
+    "author": "Id of the account that stops the device.",
 }
 
 
@@ -111,6 +112,21 @@ def document() -> dict[str, Any]:
             "body": references["Command"],
         },
         "required": ["key", "signature", "body"],
+        "additionalProperties": False,
+    }
+    references["Tagged"] = {"$ref": "#/components/schemas/Tagged"}
+    schemas["Tagged"] = {
+        "title": "Tagged",
+        "description": (
+            "HMAC-SHA256 with the lease's `setpoint_key` over `telescope/v1/setpoint` + line feed + the topic + line "
+            "feed + the exact bytes of `body`; the first 16 bytes."
+        ),
+        "type": "object",
+        "properties": {
+            "tag": {"type": "string", "pattern": "^[0-9a-f]{32}$", "description": "The tag in hexadecimal."},
+            "body": references["Setpoint"],
+        },
+        "required": ["tag", "body"],
         "additionalProperties": False,
     }
     frame_format = inspect.cleandoc(camera_frames.__doc__ or "")

@@ -28,7 +28,7 @@ SERVICE_SUBSCRIBE = (
     *(f"{_EVERY_DEVICE}/{kind}/+" for kind in (topics.DESC, topics.TELE, topics.LATE)),
 )
 """Topics to which the functions subscribe: all messages of agents but setpoints and camera frames."""
-_COMMANDS = (f"{_EVERY_DEVICE}/{topics.CMD}", f"{_EVERY_DEVICE}/{topics.STOP}")
+_COMMANDS = (f"{_EVERY_DEVICE}/{topics.CMD}", f"{_EVERY_DEVICE}/{topics.STOP}/+")
 SERVICE_PUBLISH = (*_COMMANDS, *SERVICE_SUBSCRIBE, revocation.TOPIC)
 """Topics to which the functions publish: commands, and messages of agents that use HTTP."""
 
@@ -139,7 +139,7 @@ def issued_at(token: str) -> float:
 def agent_command_topics(space: str, agent: str) -> tuple[str, ...]:
     """Topics on which an agent receives commands, setpoints and Stop."""
     own = f"{topics.ROOT}/{space}/{agent}/+"
-    return (f"{own}/{topics.CMD}", f"{own}/{topics.CTL}/+", f"{own}/{topics.STOP}")
+    return (f"{own}/{topics.CMD}", f"{own}/{topics.CTL}/+", f"{own}/{topics.STOP}/+")
 
 
 def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> Grant:
@@ -193,7 +193,7 @@ def gateway_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
 
     The gateway's responses are published by the functions.
     """
-    kinds = (topics.CMD, topics.STOP, f"{topics.CTL}/+", f"{topics.TELE}/+")
+    kinds = (topics.CMD, f"{topics.STOP}/+", f"{topics.CTL}/+", f"{topics.TELE}/+")
     return Grant(
         principal="service:gateway",
         client_id=client_id,

@@ -78,7 +78,7 @@ def verify(payload: bytes, keys: Mapping[str, Ed25519PublicKey], *, context: byt
     envelope = codec.decode(payload, Signed)
     key = keys.get(envelope.key)
     if key is None:
-        raise SignatureError(f"signed with key '{envelope.key[:32]}', which this device has not pinned")
+        raise SignatureError(f"signed with key {envelope.key[:32]!r}, which this device has not pinned")
     body = bytes(envelope.body)
     try:
         key.verify(_unbase64(envelope.signature), context + body)

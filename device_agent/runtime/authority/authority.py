@@ -7,6 +7,8 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from msgspec.structs import replace
+
 from device_agent.protocol import StopLatch
 from device_agent.protocol.events import EventKind
 from device_agent.runtime.authority.event_recorder import EventRecord, RecordEvent, Severity
@@ -67,10 +69,12 @@ class Authority:
         """The lease in force."""
         return self._gate.current(now_s)
 
-    def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> bool:
+    def grant(
+        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: tuple[bytes, ...] = ()
+    ) -> bool:
         """See ``Controller.grant``. Returns True if the epoch is new and the previous holder lost control."""
         before, previous = self._gate.epoch, self._gate.granted
-        self._gate.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason)
+        self._gate.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason, keys=keys)
         new = self._superseded(before, previous)
         if previous is None or previous.epoch != epoch:
             self.record(EventKind.LEASE_GRANTED, f"{holder} took control", {"epoch": epoch, "holder": holder})
@@ -96,11 +100,14 @@ class Authority:
             self.end(Refused("lease_lost", "the lease expired"), previous)
 
     def stop(self, latch: StopLatch) -> None:
-        """Latch Stop. The first latch remains the one shown."""
+        """Latch Stop. The first latch remains the one shown, but a verified caller replaces an unverified one."""
+        data = {"caller": latch.caller, "reason": latch.reason, "verified": latch.verified}
         if self.latch is None:
             self.latch = latch
-            data = {"caller": latch.caller, "reason": latch.reason}
             self.record(EventKind.STOP_LATCHED, f"stopped by {latch.caller}", data, "warning")
+        elif latch.verified and not self.latch.verified:
+            self.latch = replace(latch, at_ms=self.latch.at_ms)
+            self.record(EventKind.STOP_VERIFIED, f"{latch.caller} sent a signed Stop", data)
         self.end(Refused("stopped", "the device was stopped"))
 
     def reset_stop(self) -> None:

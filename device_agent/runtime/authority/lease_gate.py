@@ -1,6 +1,6 @@
 """Lease gate: accepts or rejects lease epochs on the agent's own clock."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from device_agent.runtime.errors import Refused
 
@@ -9,13 +9,15 @@ from device_agent.runtime.errors import Refused
 class Lease:
     """Right to move the device until ``expires_s`` on the agent's monotonic clock [s].
 
-    ``reason`` states why control was taken from the previous holder.
+    ``reason`` states why control was taken from the previous holder. ``keys`` authenticate the setpoints of this epoch;
+    without a key, none is accepted.
     """
 
     holder: str
     epoch: int
     expires_s: float
     reason: str = ""
+    keys: tuple[bytes, ...] = field(default=(), repr=False)
 
 
 class LeaseGate:
@@ -30,7 +32,9 @@ class LeaseGate:
         self.burned = max(burned, 0)
         self._lease: Lease | None = None
 
-    def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
+    def grant(
+        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: tuple[bytes, ...] = ()
+    ) -> None:
         """Accept a signed grant or renewal.
 
         Raises:
@@ -42,7 +46,7 @@ class LeaseGate:
         self.epoch = epoch
         if self._lease is not None:  # a renewal keeps the reason of the grant
             reason = reason or self._lease.reason
-        self._lease = Lease(holder, epoch, now_s + lease_s, reason)
+        self._lease = Lease(holder, epoch, now_s + lease_s, reason, keys)
 
     def fence(self, epoch: int) -> None:
         """Reject an older epoch. A newer epoch ends the lease in force.

@@ -29,9 +29,11 @@ from device_agent.protocol import (
     Twin,
     WithdrawRequest,
     codec,
+    topics,
 )
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.events import EventKind
+from device_agent.protocol.fields import printable
 from device_agent.protocol.security import signing
 from device_agent.runtime.actions.executor import ActionExecutor
 from device_agent.runtime.authority.control_request import PendingControlRequest
@@ -211,9 +213,15 @@ class CommandProcessor:
     def _apply(self, command: Command) -> None:
         now_s = time.monotonic()
         match command.request:
-            case GrantLease(holder=holder, lease_ms=lease_ms, reason=reason):
+            case GrantLease(holder=holder, lease_ms=lease_ms, reason=reason, pairing=pairing):
+                topic = topics.device(*self._address, topics.CTL, str(command.epoch))
                 self._controller.grant(
-                    epoch=command.epoch, holder=holder, lease_s=lease_ms / 1000, now_s=now_s, reason=reason
+                    epoch=command.epoch,
+                    holder=holder,
+                    lease_s=lease_ms / 1000,
+                    now_s=now_s,
+                    reason=printable(reason),
+                    keys=self._keys.setpoint_keys(topic, pairing),
                 )
             case RequestControl() as request:
                 lease = self._controller.lease(now_s)
@@ -223,7 +231,8 @@ class CommandProcessor:
             case ReleaseLease():
                 self._controller.release(epoch=command.epoch)
             case StopDevice(reason=reason):
-                self._controller.stop(StopLatch(caller=command.caller, reason=reason, at_ms=wall_ms()))
+                latch = StopLatch(caller=command.caller, reason=printable(reason), at_ms=wall_ms(), verified=True)
+                self._controller.stop(latch)
                 self._wake()
             case ResetStop():
                 self._reset_stop(command)

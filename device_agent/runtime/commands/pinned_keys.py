@@ -4,14 +4,14 @@ import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from msgspec.structs import replace
 
 from device_agent.config.errors import ConfigError
 from device_agent.config.identity_store import Pairing
 from device_agent.protocol import codec
 from device_agent.protocol.errors import ProtocolError, SignatureError
-from device_agent.protocol.security import key_rotation, signing
+from device_agent.protocol.security import key_rotation, setpoints, signing
 from device_agent.protocol.security.key_rotation import NewKey
 from device_agent.runtime.errors import Refused
 
@@ -24,16 +24,23 @@ class PinnedKeys(Mapping[str, Ed25519PublicKey]):
 
     Args:
         pairing: With the stored keys.
+        identity: The agent's private key.
         save: Stores the pairing; a new key is valid only after that.
         now_ms: The cloud's time [ms], or ``None`` while it is unknown. Then no key expires, but without the time the
             agent accepts only a Stop.
     """
 
     def __init__(
-        self, pairing: Pairing, *, save: Callable[[Pairing], None], now_ms: Callable[[], float | None]
+        self,
+        pairing: Pairing,
+        *,
+        identity: Ed25519PrivateKey,
+        save: Callable[[Pairing], None],
+        now_ms: Callable[[], float | None],
     ) -> None:
         self._lock = threading.Lock()
         self._pairing = pairing
+        self._identity = identity
         self._keys = pairing.public_keys()
         self._save = save
         self._now_ms = now_ms
@@ -59,6 +66,10 @@ class PinnedKeys(Mapping[str, Ed25519PublicKey]):
         """Serial number of the newest key."""
         with self._lock:
             return self._pairing.serial
+
+    def setpoint_keys(self, topic: str, pairing: str) -> tuple[bytes, ...]:
+        """Keys that authenticate setpoints on ``topic``, one per valid pinned key; see ``setpoints.lease_key``."""
+        return tuple(setpoints.lease_key(self._identity, key, topic=topic, pairing=pairing) for key in self.values())
 
     def follow(self, statements: Iterable[str]) -> None:
         """Pin the keys that the statements introduce, oldest first. Keys that are pinned already are skipped.

@@ -56,14 +56,17 @@ class Controller:
 
     # ------------------------------------------------------------ leases, Stop, faults
 
-    def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
-        """Accept a signed grant or renewal of the lease.
+    def grant(
+        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: tuple[bytes, ...] = ()
+    ) -> None:
+        """Accept a signed grant or renewal of the lease. ``keys`` authenticate its setpoints.
 
         Raises:
             Refused: The epoch is stale or burned.
         """
         with self._lock:
-            if self._state.authority.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason):
+            authority = self._state.authority
+            if authority.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason, keys=keys):
                 self._state.stream.reset(self._state.motion.position_rad)
 
     def release(self, *, epoch: int) -> None:
@@ -98,7 +101,7 @@ class Controller:
             self._state.authority.restrictions.clear(source)
 
     def stop(self, latch: StopLatch) -> None:
-        """Latch Stop. The first latch remains the one shown."""
+        """Latch Stop; see ``Authority.stop``."""
         with self._lock:
             self._state.authority.stop(latch)
 

@@ -49,6 +49,7 @@ class SetpointStream:
         self._has_base = robot_type.base is not None
         self._limiter = LatencyLimiter(geometry, watchdog_s=WATCHDOG_S, max_age_s=MAX_LOOP_AGE_S)
         self._speed = robot_type.streaming_speed
+        self._newest = (0, 0)
         self.reset([0.0] * len(robot_type.joints))
 
     def reset(self, position_rad: Sequence[float]) -> None:
@@ -66,13 +67,15 @@ class SetpointStream:
         self.applied_sequence, self.sent_ms, self.loop_age_ms = 0, 0.0, 0.0
 
     def check(self, setpoint: Setpoint, *, tick_ms: int) -> None:
-        """Check that a setpoint is newer than the last one, and that it echoes recent telemetry.
+        """Check that a setpoint is newer than all before, also rejected ones, and that it echoes recent telemetry.
 
         Raises:
-            Refused: It is or does not.
+            Refused: It is not or does not.
         """
-        if self._setpoint is not None and setpoint.sequence <= self._setpoint.sequence:
+        newest = (setpoint.epoch, setpoint.sequence)
+        if newest <= self._newest:
             raise Refused("out_of_order", "a newer setpoint has arrived already")
+        self._newest = newest
         age_ms = tick_ms - setpoint.echo_tick_ms
         max_ms = MAX_LOOP_AGE_S * 1000
         if not 0 <= age_ms <= max_ms:

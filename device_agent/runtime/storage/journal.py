@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from device_agent.protocol import Ack, AckStatus, Reason, StopLatch, codec
+from device_agent.protocol.errors import ProtocolError
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS commands (
@@ -171,7 +172,7 @@ class Journal:
         if not rows:
             return DeviceRecord()
         epoch, burned, latch = rows[0]
-        return DeviceRecord(epoch, burned, codec.decode(latch, StopLatch) if latch else None)
+        return DeviceRecord(epoch, burned, _latch(latch) if latch else None)
 
     def save_epoch(self, device: str, *, epoch: int, burned: int) -> None:
         """Record a device's epochs; they never decrease."""
@@ -235,3 +236,11 @@ class Journal:
             return self._database.execute(sql, values).fetchall()
         except sqlite3.Error as error:
             raise JournalError(f"the journal {self._path} cannot be written ({error}): is the disk full?") from error
+
+
+def _latch(payload: bytes) -> StopLatch:
+    """The stored Stop latch. One that cannot be read, for example of another version, still holds the device."""
+    try:
+        return codec.decode(payload, StopLatch)
+    except ProtocolError:
+        return StopLatch(caller="unknown (unverified)", reason="", at_ms=0)

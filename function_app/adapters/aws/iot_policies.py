@@ -10,6 +10,7 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
+from device_agent.protocol import topics
 from device_agent.protocol.security.grants import Grant, agent_grant
 from function_app.ports.broker_access import BrokerAccessError
 
@@ -65,7 +66,7 @@ def documents(grant: Grant, *, arn_prefix: str) -> list[str]:
     statements = [_statement("Allow", "iot:Connect", [f"{arn_prefix}:client/{grant.client_id}"])]
     for action, kind, patterns in (
         ("iot:Publish", "topic", grant.publish),
-        ("iot:RetainPublish", "topic", grant.publish),
+        ("iot:RetainPublish", "topic", tuple(filter(topics.may_retain, grant.publish))),
         ("iot:Subscribe", "topicfilter", grant.subscribe),
         ("iot:Receive", "topic", grant.subscribe),
     ):

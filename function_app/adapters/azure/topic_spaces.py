@@ -74,11 +74,11 @@ def _setpoint_topics(values: Mapping[str, str]) -> _Topics:
 
 
 def _space_stop_topics(values: Mapping[str, str]) -> _Topics:
-    return [topics.device(values["space"], topics.ANY, topics.ANY, topics.STOP)], ()
+    return [topics.device(values["space"], topics.ANY, topics.ANY, topics.STOP, values["author"])], ()
 
 
 def _device_stop_topics(values: Mapping[str, str]) -> _Topics:
-    return [topics.device(values["space"], values["agent"], values["device"], topics.STOP)], ()
+    return [topics.device(values["space"], values["agent"], values["device"], topics.STOP, values["author"])], ()
 
 
 def _space_filters(values: Mapping[str, str]) -> _Topics:
@@ -96,8 +96,8 @@ _GROUPS: Mapping[str, tuple[str, tuple[_Permission, ...]]] = {
         "account",
         (
             _Permission("control", 1, (*_DEVICE, "epoch"), _setpoint_topics),
-            _Permission("stop_all", SPACES, ("space",), _space_stop_topics),
-            _Permission("stop", STOPS, _DEVICE, _device_stop_topics),
+            _Permission("stop_all", SPACES, ("space", "author"), _space_stop_topics),
+            _Permission("stop", STOPS, (*_DEVICE, "author"), _device_stop_topics),
             _Permission("watch_all", SPACES, ("space",), _space_filters),
             _Permission("watch", DEVICES, _DEVICE, _device_filters),
         ),

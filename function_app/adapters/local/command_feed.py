@@ -62,7 +62,7 @@ class MqttCommandFeed:
 def _patterns(space: str, agent: str) -> tuple[str, ...]:
     return (
         topics.device(space, agent, ANY, topics.CMD),
-        topics.device(space, agent, ANY, topics.STOP),
+        topics.device(space, agent, ANY, topics.STOP, ANY),
         topics.device(space, agent, ANY, topics.CTL, ANY),
         topics.conn(space, agent),
     )

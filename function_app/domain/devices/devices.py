@@ -90,6 +90,7 @@ class Device:
         owner: Account of the agent. Its movements and robot types apply, for every caller.
         until_ms: When the role changes [ms since 1970].
         space_role: Role in the whole space; ``None`` for access to this device only.
+        agent_key: Public key of the agent.
     """
 
     id: str
@@ -106,6 +107,7 @@ class Device:
     owner: str = ""
     until_ms: int = NEVER_MS
     space_role: Role | None = None
+    agent_key: str = ""
 
 
 def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) -> Agent:

@@ -128,7 +128,7 @@ class StopDevices:
         self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
     ) -> bool:
         """Send the plain message and the signed command; write the tables concurrently."""
-        plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), caller=caller.name, reason=reason)))
+        plain = asyncio.create_task(self._repeat(device, caller.account, Stop(id=new_id(), reason=reason)))
         writing: asyncio.Task[None] | None = None
         try:
             await asyncio.sleep(0)  # publish first, before signing and writing
@@ -144,11 +144,11 @@ class StopDevices:
             if writing is not None:
                 await writing
 
-    async def _repeat(self, device: Device, stop: Stop) -> None:
+    async def _repeat(self, device: Device, author: str, stop: Stop) -> None:
         payload = codec.encode(stop)
         while True:
             try:
-                await self._delivery.stop(device, payload)
+                await self._delivery.stop(device, author, payload)
             except BusUnavailable as error:
                 _log.warning("stop of %s: %s", device.id, error)
                 raise

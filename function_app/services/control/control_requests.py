@@ -5,6 +5,7 @@ import logging
 from collections.abc import Callable
 
 from device_agent.protocol import RequestControl, WithdrawRequest
+from device_agent.protocol.fields import printable
 from function_app.domain.common.ids import new_id
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import control_request as rules
@@ -80,7 +81,9 @@ class ControlRequests:
         control_request = lease.request
         assert control_request is not None  # noqa: S101 (the rule has just written it)
         left_ms = max(1, control_request.expires_ms - self._clock.now_ms())
-        order = RequestControl(request=control_request.id, requester=control_request.by, answer_within_ms=left_ms)
+        order = RequestControl(
+            request=control_request.id, requester=printable(control_request.by), answer_within_ms=left_ms
+        )
         try:
             shown = await self._command_sender.send_confirmed(
                 device, order, caller=caller.name, epoch=lease.epoch, wait_ms=wait_ms

@@ -2,7 +2,9 @@
 
 import logging
 
-from device_agent.protocol import GrantLease, ReleaseLease
+from device_agent.protocol import GrantLease, ReleaseLease, topics
+from device_agent.protocol.fields import printable
+from device_agent.protocol.security import setpoints, signing
 from function_app.domain.actions.queue import UNSHARED
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import lease as rules
@@ -10,6 +12,7 @@ from function_app.domain.control.lease import Lease
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import Tables
 from function_app.services.control.control_events import ControlEvents
 from function_app.services.control.fencing import ControlRevocation
@@ -33,6 +36,7 @@ class Leases:
         revocation: ControlRevocation,
         command_sender: CommandSender,
         control_events: ControlEvents,
+        keys: SigningKeys,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -41,6 +45,7 @@ class Leases:
         self._revocation = revocation
         self._command_sender = command_sender
         self._control_events = control_events
+        self._keys = keys
         self._clock = clock
 
     async def get(self, caller: Identity, device_id: str) -> Lease | None:
@@ -53,9 +58,10 @@ class Leases:
 
     async def acquire(
         self, caller: Identity, device_id: str, *, epoch: int | None, lease_ms: int, wait_ms: int, over: str = ""
-    ) -> tuple[Lease, bool]:
-        """Acquire the lease, or renew ``epoch``; also return whether the device confirmed within ``wait_ms``.
+    ) -> tuple[Lease, bool, bytes]:
+        """Acquire the lease, or renew ``epoch``.
 
+        Also returns whether the device confirmed within ``wait_ms``, and the key that authenticates setpoints.
         ``over`` is the reason for a takeover, which requires the role owner. The caller's permission on the device
         limits ``lease_ms``. Raises ``device-unknown``, ``forbidden``, ``lease-held``, ``lease-lost`` or ``busy``.
         """
@@ -77,7 +83,16 @@ class Leases:
         confirmed = await self.grant(device, lease, by=caller.name, wait_ms=wait_ms)
         if before is not None and lease.reason and epoch is None:
             await self._revocation.cut(device, before.epoch)
-        return lease, confirmed
+        return lease, confirmed, await self._setpoint_key(device, lease.epoch)
+
+    async def _setpoint_key(self, device: Device, epoch: int) -> bytes:
+        """The key of a lease. The device accepts it while it pins the signing key from which it is derived."""
+        return setpoints.lease_key(
+            await self._keys.for_devices(),
+            signing.public_key(device.agent_key),
+            topic=topics.device(device.space, device.agent, device.name, topics.CTL, str(epoch)),
+            pairing=device.pairing,
+        )
 
     async def release(self, caller: Identity, device_id: str, *, epoch: int) -> None:
         """Release the lease. The device holds, and the credentials for its setpoints are revoked.
@@ -109,7 +124,9 @@ class Leases:
 
     async def grant(self, device: Device, lease: Lease, *, by: str, wait_ms: int) -> bool:
         """Send the lease to the device; return whether it confirmed. The lease is valid in any case."""
-        order = GrantLease(holder=lease.holder, lease_ms=lease.lease_ms, reason=lease.reason)
+        order = GrantLease(
+            holder=printable(lease.holder), lease_ms=lease.lease_ms, reason=lease.reason, pairing=device.pairing
+        )
         try:
             return await self._command_sender.send_confirmed(
                 device, order, caller=by, epoch=lease.epoch, wait_ms=wait_ms

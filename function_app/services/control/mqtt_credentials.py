@@ -76,7 +76,7 @@ class MqttCredentials:
         return issued
 
     async def _watch(self, caller: Identity, devices: list[Device]) -> IssuedCredentials:
-        watched = _view_filters(devices, self._access)
+        watched = _view_filters(devices, self._access, author=caller.account)
         seen = watched.devices
         now_ms = self._clock.now_ms()
         ends_ms = min([now_ms + WATCH_S * 1000, caller.until_ms, *(device.until_ms for device in seen)])
@@ -180,8 +180,8 @@ class _ViewFilters:
         return True
 
 
-def _view_filters(devices: list[Device], access: BrokerAccess) -> _ViewFilters:
-    """The filters to view these devices, and the devices that fit.
+def _view_filters(devices: list[Device], access: BrokerAccess, *, author: str) -> _ViewFilters:
+    """The filters to view these devices and to stop them as ``author``, and the devices that fit.
 
     Whole spaces come first. All filters are part of one CONNECT, whose size brokers limit, so further devices are left
     out. Share the space instead of many single devices.
@@ -189,16 +189,17 @@ def _view_filters(devices: list[Device], access: BrokerAccess) -> _ViewFilters:
     result = _ViewFilters()
     covered: set[str] = set()
     for space, role in sorted({(device.space, device.space_role) for device in devices if device.space_role}):
-        stop_filters = [topics.device(space, topics.ANY, topics.ANY, topics.STOP)] if role.may_operate else []
+        stop_filters = [topics.device(space, topics.ANY, topics.ANY, topics.STOP, author)] if role.may_operate else []
         if not result.add(stop_filters, grants.device_subscriptions(space, topics.ANY, topics.ANY), access):
             break
         members = [device for device in devices if device.space == space and device.space_role]
         result.devices += members
         covered |= {device.id for device in members}
-        result.stops += [_stop(device) for device in members if role.may_operate]
+        result.stops += [_stop(device, author) for device in members if role.may_operate]
     stoppable = set(result.stops)
     for device in devices:
-        stop_filters = [_stop(device)] if device.role.may_operate and _stop(device) not in stoppable else []
+        stop_filters = [_stop(device, author)] if device.role.may_operate else []
+        stop_filters = [topic for topic in stop_filters if topic not in stoppable]
         view_filters = (
             () if device.id in covered else grants.device_subscriptions(device.space, device.agent, device.name)
         )
@@ -211,8 +212,8 @@ def _view_filters(devices: list[Device], access: BrokerAccess) -> _ViewFilters:
     return result
 
 
-def _stop(device: Device) -> str:
-    return f"{device.topic}/{topics.STOP}"
+def _stop(device: Device, author: str) -> str:
+    return f"{device.topic}/{topics.STOP}/{author}"
 
 
 def _rights(devices: list[Device]) -> set[tuple[object, ...]]:

@@ -321,4 +321,5 @@ def _device(agent: Agent, spec: DeviceSpec, allowed: Permissions = OWNER_PERMISS
         owner=agent.account or "",
         until_ms=allowed.until_ms,
         space_role=allowed.space,
+        agent_key=agent.public_key,
     )

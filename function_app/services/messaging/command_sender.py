@@ -6,6 +6,7 @@ from msgspec.structs import replace
 
 from device_agent.protocol import CancelAction, Command, Request, RunMovement, StopDevice, codec
 from device_agent.protocol.errors import ProtocolError, SignatureError
+from device_agent.protocol.fields import printable
 from device_agent.protocol.security import signing
 from function_app.domain.actions.action import Action
 from function_app.domain.common.ids import command_id
@@ -150,7 +151,7 @@ def _command(
         device=device.name,
         issued_at_ms=issued_ms,
         ttl_ms=ttl_ms,
-        caller=caller,
+        caller=printable(caller),
         epoch=epoch,
         request=request,
     )

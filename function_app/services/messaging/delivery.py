@@ -62,16 +62,19 @@ class Delivery:
         if device.transport == "xmpp":
             await self._relay_message(topic, signed.payload)
 
-    async def stop(self, device: Device, payload: bytes) -> None:
-        """Publish the plain Stop message. A polling agent gets only the signed command, which stays until acknowledged.
+    async def stop(self, device: Device, author: str, payload: bytes) -> None:
+        """Publish the plain Stop message of the account ``author``.
+
+        A polling agent gets only the signed command, which stays until acknowledged.
 
         Raises:
             BusUnavailable: The broker did not confirm it.
         """
+        topic = f"{device.topic}/{topics.STOP}/{author}"
         if device.transport == "mqtt":
-            await self._bus.publish(f"{device.topic}/{topics.STOP}", payload)
+            await self._bus.publish(topic, payload)
         elif device.transport == "xmpp":
-            await self._relay_message(f"{device.topic}/{topics.STOP}", payload)
+            await self._relay_message(topic, payload)
 
     async def withdraw(self, device: Device, command: str) -> None:
         """Remove a command that the agent has not fetched. Published commands are not affected."""

@@ -109,6 +109,20 @@ def test_a_publish_beyond_the_contract_closes_the_connection(
         assert client.ended()
 
 
+@pytest.mark.parametrize("kind", ["ctl/7", "cmd", "stop/account", "ack", "event", "tele/joints"])
+def test_a_retained_message_of_a_class_without_retention_is_rejected(
+    broker: RunningBroker, space: str, kind: str
+) -> None:
+    topic = f"ts/v1/{space}/arm/ur5/{kind}"
+    with broker.client(space, publish=(topic,), subscribe=(topic,)) as client:
+        client.subscribe(topic)
+        client.publish(topic, b"x", retain=True)
+        assert client.ended()
+        assert client.pending() == []
+    credentials = broker.issue(broker.grant(space, publish=(topic,)))
+    assert not broker.accepts(space, credentials, will=Message(topic, b"x", 1, retain=True))
+
+
 def test_a_denied_filter_does_not_affect_others(broker: RunningBroker, space: str) -> None:
     mine = f"ts/v1/{space}/arm/+"
     rejected = ("#", "ts/v1/+/arm/conn", f"{mine}/#", "$SYS/#", "", "ts/v1/#/conn", f"ts/v1/{space}/arm/a+", "x" * 600)

@@ -139,7 +139,7 @@ def test_the_epoch_in_the_topic_fences_a_former_holder(broker: RunningBroker, sp
     device = f"ts/v1/{space}/arm/ur5"
     with listen(broker, space, f"{device}/ctl/+") as listener:
         for epoch in ("6", "50", "4", "5x"):
-            with broker.client(f"{space}-former", publish=(f"{device}/ctl/5", f"{device}/stop")) as former:
+            with broker.client(f"{space}-former", publish=(f"{device}/ctl/5", f"{device}/stop/account")) as former:
                 former.publish(f"{device}/ctl/{epoch}", b"too late", qos=0)
                 assert listener.received() == []
         with broker.client(f"{space}-former", publish=(f"{device}/ctl/5",)) as holder:
@@ -224,7 +224,7 @@ def test_the_functions_receive_from_agents_and_command_devices(broker: RunningBr
     published = [f"{own}/conn", *(f"{own}/ur5/{kind}" for kind in kinds)]
     with broker.connect("arm", agent_of(broker, space, "arm")) as arm, broker.service() as functions:
         assert functions.subscribe(*grants.SERVICE_SUBSCRIBE) == [1] * len(grants.SERVICE_SUBSCRIBE)
-        assert arm.subscribe(f"{own}/+/cmd", f"{own}/+/stop") == [1, 1]
+        assert arm.subscribe(f"{own}/+/cmd", f"{own}/+/stop/+") == [1, 1]
         for topic in published:
             arm.publish_acknowledged(topic, b"x")
         received: list[str] = []
@@ -233,7 +233,7 @@ def test_the_functions_receive_from_agents_and_command_devices(broker: RunningBr
             received += [topic] if f"/{space}/" in topic else []
         assert received == published
         functions.publish_acknowledged(f"{own}/ur5/cmd", b"move")
-        functions.publish_acknowledged(f"{own}/ur5/stop", b"stop")
+        functions.publish_acknowledged(f"{own}/ur5/stop/account", b"stop")
         assert arm.payloads(2) == [b"move", b"stop"]
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec, topics
+from device_agent.protocol.security import setpoints
 from tests.harness.browser.product import Api, Machine, enroll, mqtt_client, start_machine
 from tests.harness.network.brokers import wait_until
 from tests.harness.paths import ROOT
@@ -167,6 +168,7 @@ def streaming(api: Api, device: dict[str, Any]) -> Iterator[tuple[Callable[[floa
     number = 0
     with mqtt_client(api, purpose="view") as (watch, viewed), mqtt_client(api, **credentials) as (control, issued):
         (topic,) = issued["publish"]
+        key = bytes.fromhex(lease["setpoint_key"])
         watched = [each for each in viewed["subscribe"] if each.split("/")[3] in device["id"] and "/tele/" in each]
         watch.paho.on_message = lambda _, __, message: seen.append(codec.decode(bytes(message.payload), JointTelemetry))
         assert all(topics.TELE in each for each in watched)
@@ -183,7 +185,7 @@ def streaming(api: Api, device: dict[str, Any]) -> Iterator[tuple[Callable[[floa
                 sent_ms=time.monotonic() * 1000,
                 target=JointTarget(position_rad={"wrist_3": target_rad}),
             )
-            control.publish(topic, codec.encode(message), qos=0)
+            control.publish(topic, setpoints.seal(codec.encode(message), key, topic), qos=0)
 
         yield setpoint, seen
     api.http.delete(f"/devices/{device['id']}/lease", params={"epoch": lease["epoch"]})

@@ -33,14 +33,14 @@ from device_agent.protocol import (
     topics,
 )
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.protocol.security import signing
+from device_agent.protocol.security import setpoints, signing
 from device_agent.runtime.device import Device
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.storage.journal import Journal
 from device_agent.runtime.storage.outbox_store import OutboxStore
 from device_agent.runtime.telemetry.outbox import Outbox
 from tests.fakes.drivers import FakeDriver, robot_type
-from tests.harness.agent.pinned_keys import pinned_keys_of
+from tests.harness.agent.pinned_keys import IDENTITY, pinned_keys_of
 from tests.harness.agent.sandbox import warm_sandbox
 
 WITHIN_S = 120.0
@@ -142,9 +142,16 @@ class DeviceHarness:
         self.device.receive(topics.Topic("s", "a", "arm", kind, name), payload)
 
     def setpoint(self, epoch: int, sequence: int, elbow: float = 2.0) -> None:
+        """Receive a setpoint of the lease's holder."""
+        self.receive(topics.CTL, self.sealed(epoch, sequence, elbow), str(epoch))
+
+    def sealed(self, epoch: int, sequence: int, elbow: float = 2.0, *, key: Ed25519PrivateKey | None = None) -> bytes:
+        """A setpoint, sealed with the key of a lease that the cloud with this ``key`` granted."""
         target = JointTarget(position_rad={"elbow": elbow})
         setpoint = Setpoint(epoch=epoch, sequence=sequence, echo_tick_ms=tick_ms(), sent_ms=0.5, target=target)
-        self.receive(topics.CTL, codec.encode(setpoint), str(epoch))
+        topic = topics.device("s", "a", "arm", topics.CTL, str(epoch))
+        lease_key = setpoints.lease_key(key or self.key, IDENTITY.public_key(), topic=topic, pairing="")
+        return setpoints.seal(codec.encode(setpoint), lease_key, topic)
 
     def published(self, kind: str, message: type[Any], name: str = "") -> list[Any]:
         expected = topics.device("s", "a", "arm", kind, name)
@@ -183,8 +190,8 @@ class DeviceHarness:
         return command
 
     def receive_stop(self) -> None:
-        """Receive a Stop of another operator."""
-        self.receive(topics.STOP, codec.encode(Stop(id="s1", caller="bob", reason="smoke")))
+        """Receive a Stop message of the account ``bob``."""
+        self.receive(topics.STOP, codec.encode(Stop(id="s1", reason="smoke")), "bob")
 
     def events(self, kind: str) -> list[Event]:
         return [event for event in self.published(topics.EVENT, Event) if event.kind == kind]

@@ -23,7 +23,7 @@ def grant(account: str, name: str = "watch", *, lifetime_s: float = 900) -> Gran
     return Grant(
         principal=f"account:{account}:s1:watch",
         client_id=f"{name}-{account}",
-        publish=(f"ts/v1/{account}/+/+/stop",),
+        publish=(f"ts/v1/{account}/+/+/stop/{account}",),
         subscribe=grants.device_subscriptions(account, "+", "+"),
         token_id=new_id(),
         expires_at=int(time.time() + lifetime_s),

@@ -268,7 +268,7 @@ class TestEventGrid(WebhookSuite):
             shared = anna.post(f"/devices/{device}/shares", {"account": bert.name, "role": "operator"})
             assert shared.status_code == 201
         assert anna.post(f"/devices/{robot.device}/stop", {"reason": "smoke"}).status_code < 300
-        assert f"ts/v1/{robot.space}/{robot.id}/arm0/stop" in gate.grid.http_topics
+        assert f"ts/v1/{robot.space}/{robot.id}/arm0/stop/{anna.account}" in gate.grid.http_topics
         issued = bert.post("/mqtt/credentials", {"purpose": "view"}).json()
         watched = {topic.split("/")[4] for topic in issued["subscribe"] if topic.endswith("/state")}
         assert len(watched) == topic_spaces.DEVICES

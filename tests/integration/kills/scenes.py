@@ -63,7 +63,7 @@ async def idle(functions: Functions) -> Scene:
 
 async def running(functions: Functions) -> Scene:
     scene = await idle(functions)
-    lease, _ = await functions.leases.acquire(scene.operator, scene.device, epoch=None, lease_ms=600_000, wait_ms=0)
+    lease, *_ = await functions.leases.acquire(scene.operator, scene.device, epoch=None, lease_ms=600_000, wait_ms=0)
     action, _ = await functions.start_action.start(scene.operator, scene.device, action_request(epoch=lease.epoch))
     return Scene(scene.operator, scene.public, scene.agent, action.id, lease.epoch)
 
@@ -244,7 +244,7 @@ async def check_scenes(functions: Functions, place: Place, scenes: list[Scene]) 
         action, _ = await functions.start_action.start(owner, scene.device, action_request())
         assert action.status.value == "published"
         await report(functions, action.id, AckStatus.DONE)
-        lease, _ = await functions.leases.acquire(owner, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
+        lease, *_ = await functions.leases.acquire(owner, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
         assert lease.epoch > action.epoch >= max(1, scene.epoch)
 
 

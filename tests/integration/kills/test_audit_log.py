@@ -142,7 +142,7 @@ async def check_records(functions: Functions, operator: Identity, agent: str, be
 async def change(functions: Functions, operator: Identity, agent: str, code: str) -> None:
     await functions.claim.claim(operator, code, None)
     device = f"{agent}-arm"
-    lease, _ = await functions.leases.acquire(operator, device, epoch=None, lease_ms=60_000, wait_ms=0)
+    lease, *_ = await functions.leases.acquire(operator, device, epoch=None, lease_ms=60_000, wait_ms=0)
     await functions.leases.release(operator, device, epoch=lease.epoch)
     await functions.leases.acquire(operator, device, epoch=None, lease_ms=60_000, wait_ms=0)
     await functions.unpair.unpair(operator, agent)

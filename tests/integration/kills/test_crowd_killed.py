@@ -46,7 +46,7 @@ async def report_some(functions: Functions, rng: random.Random, people: Two, sce
 
 
 async def control(functions: Functions, rng: random.Random, people: Two, scene: Scene) -> None:
-    lease, _ = await functions.leases.acquire(people[0], scene.device, epoch=None, lease_ms=3_000, wait_ms=0)
+    lease, *_ = await functions.leases.acquire(people[0], scene.device, epoch=None, lease_ms=3_000, wait_ms=0)
     policy = rng.choice(("reject", "queue"))
     await functions.start_action.start(people[0], scene.device, action_request(epoch=lease.epoch, policy=policy))
     await functions.leases.release(people[0], scene.device, epoch=lease.epoch)

@@ -55,7 +55,7 @@ def test_setpoints_and_stop_of_a_console_reach_the_robot_over_the_broker(
     assert [codec.decode(payload, Setpoint).sequence for _, payload in robot.setpoints] == list(range(1, 21))
     issued = anna.post("/mqtt/credentials", {"purpose": "view"}).json()
     with broker.connect(issued["client_id"], (issued["username"], issued["password"])) as console:  # type: ignore[arg-type]
-        console.publish(robot.topic(topics.STOP), codec.encode(Stop(id="s1", caller="anna")))
+        console.publish(f"{robot.topic(topics.STOP)}/{anna.account}", codec.encode(Stop(id="s1")))
         wait_until(lambda: any(stop.id == "s1" for stop in robot.stops), "the Stop")
 
 

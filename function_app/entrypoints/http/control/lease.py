@@ -50,7 +50,7 @@ def _lease_routes(routes: Routes, functions: Functions, auth: RequestAuthenticat
         over = payload.reason.strip() if payload.take_over else ""
         if payload.take_over and (not over or payload.epoch is not None):
             raise invalid("take_over requires a reason, which is sent to the previous holder, and excludes epoch.")
-        lease, confirmed = await functions.leases.acquire(
+        lease, confirmed, setpoint_key = await functions.leases.acquire(
             caller, device, epoch=payload.epoch, lease_ms=payload.lease_ms, wait_ms=payload.wait_ms, over=over
         )
         body = schemas.LeaseGranted(
@@ -59,8 +59,9 @@ def _lease_routes(routes: Routes, functions: Functions, auth: RequestAuthenticat
             expires_at=rfc3339(lease.expires_ms),
             lease_ms=lease.lease_ms,
             confirmed=confirmed,
+            setpoint_key=setpoint_key.hex(),
         )
-        return json_response(body)
+        return json_response(body, headers={"Cache-Control": "no-store"})
 
     @routes.add("DELETE /devices/{device}/lease", "Release control", None, (404, 409, 422))
     async def release_lease(request: Request, device: str, epoch: EpochQuery) -> Response:

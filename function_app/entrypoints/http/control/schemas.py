@@ -51,13 +51,17 @@ class LeaseRequest(Request, frozen=True, kw_only=True):
 
 
 class LeaseGranted(Response, frozen=True, kw_only=True):
-    """The caller's lease. ``confirmed``: the device has acknowledged it."""
+    """The caller's lease. ``confirmed``: the device has acknowledged it.
+
+    ``setpoint_key``: secret key in hexadecimal that authenticates the setpoints of this lease.
+    """
 
     epoch: int
     holder: str
     expires_at: Moment
     lease_ms: int
     confirmed: bool
+    setpoint_key: str
 
 
 class LeaseStatus(Response, frozen=True, kw_only=True):

@@ -34,9 +34,9 @@ from device_agent.protocol import (
     topics,
 )
 from device_agent.protocol.events import EventKind
-from device_agent.protocol.security import signing
+from device_agent.protocol.security import setpoints, signing
 from device_agent.runtime.control import setpoint_stream
-from tests.harness.agent.pinned_keys import pinned_keys_of
+from tests.harness.agent.pinned_keys import IDENTITY, pinned_keys_of
 
 SPACE, AGENT = "space", "agent"
 FAR = {"joint_1": 3.0}
@@ -97,7 +97,9 @@ class RobotFixture:
     ) -> None:
         tick_ms = round(self.now_s * 1000) - age_ms
         setpoint = Setpoint(epoch=epoch, sequence=sequence, echo_tick_ms=tick_ms, sent_ms=7.0, target=target)
-        self.receive(topics.CTL, codec.encode(setpoint), topic or str(epoch))
+        address = topics.device(SPACE, AGENT, DEVICE, topics.CTL, topic or str(epoch))
+        key = setpoints.lease_key(self.key, IDENTITY.public_key(), topic=address, pairing="")
+        self.receive(topics.CTL, setpoints.seal(codec.encode(setpoint), key, address), topic or str(epoch))
 
     def advance(self, seconds: float) -> JointTelemetry:
         self.now_s += seconds
@@ -196,7 +198,7 @@ def test_unauthenticated_and_misdirected_messages_are_ignored(fixture: RobotFixt
     fixture.command(StopDevice(), key=signing.generate())
     fixture.command(StopDevice(), device="leg")
     fixture.receive(topics.CMD, b"{}")
-    fixture.robot.receive("ts/v1/space/other/arm/stop", codec.encode(Stop(id="s", caller="x")), fixture.now_s)
+    fixture.robot.receive("ts/v1/space/other/arm/stop", codec.encode(Stop(id="s")), fixture.now_s)
     fixture.robot.receive("nonsense", b"", fixture.now_s)
     assert fixture.messages(topics.ACK, Ack) == []
     assert fixture.advance(0.1).mode is Mode.IDLE
@@ -217,7 +219,7 @@ def test_stop_ends_the_action_holds_and_latches_until_it_is_reset(fixture: Robot
     fixture.acquire()
     move = fixture.command(MOVE, epoch=1)
     fixture.advance(0.5)
-    fixture.receive(topics.STOP, codec.encode(Stop(id="s", caller="bob")))
+    fixture.receive(topics.STOP, codec.encode(Stop(id="s")), "bob")
     assert fixture.reason_code(move) == "stopped"
     assert fixture.advance(0.1).position_rad == fixture.advance(5.0).position_rad
     assert fixture.reason_code(fixture.command(MOVE, epoch=2)) == "stopped"

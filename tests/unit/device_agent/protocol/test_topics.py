@@ -54,4 +54,5 @@ def test_invalid_topics_are_rejected(topic: str) -> None:
 def test_topics_are_parsed() -> None:
     assert topics.parse(topics.conn("s", "a")) == ("s", "a", "", "conn", "")
     assert topics.parse(topics.device("s", "a", "d", topics.CTL, "5")) == ("s", "a", "d", "ctl", "5")
+    assert topics.parse(topics.device("s", "a", "d", topics.STOP, "account")) == ("s", "a", "d", "stop", "account")
     assert topics.parse(topics.device("s", "a", "d", topics.DESC)) == ("s", "a", "d", "desc", "")

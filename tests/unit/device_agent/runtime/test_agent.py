@@ -69,7 +69,7 @@ def test_a_device_holds_before_the_link_starts_and_stop_is_idempotent(fixture: A
 
 
 def test_only_messages_for_the_device_reach_it(fixture: AgentFixture) -> None:
-    stop = codec.encode(Stop(id="s1", caller="bob"))
+    stop = codec.encode(Stop(id="s1"))
     for topic in ("ts/v1/s/a/leg/stop", "ts/v2/s/a/arm/stop", "$SYS", "", "ts/v1/x/y/arm/stop"):
         fixture.link.receive(topic, stop)
     assert fixture.harness.device._controller.latch is None

@@ -2,33 +2,33 @@
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from device_agent.ports.clock import tick_ms, wall_ms
+from device_agent.ports.clock import wall_ms
 from device_agent.protocol import (
     Ack,
     AckStatus,
     CancelAction,
     Description,
     GrantLease,
-    JointTarget,
     Mode,
     MoveJoints,
     ReleaseLease,
     RequestControl,
     ResetStop,
     RotateKey,
-    Setpoint,
     State,
     StopDevice,
     WithdrawRequest,
     codec,
     topics,
 )
-from device_agent.protocol.security import signing
+from device_agent.protocol.events import EventKind
+from device_agent.protocol.security import setpoints, signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
 from device_agent.runtime.control.controller import Controller
 from tests.harness.agent.device_harness import WITHIN_S, DeviceHarness, eventually, wait_for_state
@@ -93,10 +93,7 @@ def test_streaming_needs_the_lease_and_moves_the_device(harness: DeviceHarness) 
     harness.setpoint(1, 1)
     assert harness.device.publisher.rejections == {"no_lease": 1}
     harness.done(grant(), epoch=1)
-    setpoint = Setpoint(
-        epoch=1, sequence=1, echo_tick_ms=tick_ms(), sent_ms=0, target=JointTarget(position_rad={"elbow": 1})
-    )
-    harness.receive(topics.CTL, codec.encode(setpoint), "2")
+    harness.receive(topics.CTL, harness.sealed(1, 1), "2")
     assert harness.device.publisher.rejections == {"no_lease": 2}, "the epoch in the topic differs"
     for sequence in range(1, 40):
         harness.setpoint(1, sequence)
@@ -109,13 +106,73 @@ def test_streaming_needs_the_lease_and_moves_the_device(harness: DeviceHarness) 
     assert lease.holder == "ann"
 
 
+def unsigned(payload: bytes) -> bytes:
+    body = codec.decode(payload, setpoints.Tagged).body
+    return bytes(body)
+
+
+@pytest.mark.parametrize(
+    ("forge", "code"),
+    [
+        (unsigned, "malformed"),
+        (lambda payload: payload.replace(b'"elbow":2.0', b'"elbow":1.0'), "bad_signature"),
+        (lambda payload: payload.replace(b'"sequence":1,', b'"sequence":9,'), "bad_signature"),
+        (lambda payload: payload.replace(b'"tag":"', b'"tag":"0'), "bad_signature"),
+        (lambda payload: payload + b" " * setpoints.MAX_BYTES, "malformed"),
+    ],
+)
+def test_a_forged_setpoint_does_not_move_the_device(
+    harness: DeviceHarness, forge: Callable[[bytes], bytes], code: str
+) -> None:
+    harness.done(grant(), epoch=1)
+    harness.receive(topics.CTL, forge(harness.sealed(1, 1)), "1")
+    assert harness.device.publisher.rejections == {code: 1}
+    assert not harness.device._controller._state.stream.active
+    harness.setpoint(1, 1)
+    assert harness.device._controller._state.stream.active, "the holder's own setpoint is accepted"
+
+
+def test_a_key_of_another_lease_or_cloud_does_not_authenticate_a_setpoint(harness: DeviceHarness) -> None:
+    harness.done(grant(), epoch=1)
+    former = harness.sealed(1, 1)
+    harness.done(grant("eve"), epoch=2)
+    for payload in (former, harness.sealed(2, 1, key=signing.generate()), harness.sealed(1, 1)):
+        harness.receive(topics.CTL, payload, "2")
+    harness.receive(topics.CTL, former, "1")
+    assert harness.device.publisher.rejections == {"bad_signature": 3, "no_lease": 1}
+
+
+def test_replayed_and_reordered_setpoints_are_rejected(harness: DeviceHarness) -> None:
+    harness.done(grant(), epoch=1)
+    older, newer = harness.sealed(1, 1), harness.sealed(1, 2)
+    for payload in (newer, newer, older):
+        harness.receive(topics.CTL, payload, "1")
+    harness.done(grant(), epoch=1)
+    harness.receive(topics.CTL, newer, "1")
+    assert harness.device.publisher.rejections == {"out_of_order": 3}, "a renewal does not reset the sequence"
+
+
+def test_a_signed_stop_replaces_the_unverified_author(harness: DeviceHarness) -> None:
+    harness.receive(topics.STOP, b'{"id":"s1","caller":"eve (owner)","reason":"a\\nforged line"}', "bob")
+    latch = wait_for_state(harness, lambda state: state.stop).stop
+    assert latch is not None
+    assert (latch.caller, latch.reason, latch.verified) == ("bob (unverified)", "a\ufffdforged line", False)
+    harness.done(StopDevice(reason="smoke"))
+    harness.done(StopDevice(reason="later"), caller="cat")
+    verified = wait_for_state(harness, lambda state: state.stop and state.stop.verified).stop
+    assert verified is not None
+    assert (verified.caller, verified.reason, verified.at_ms) == ("ann", "smoke", latch.at_ms)
+    (event,) = harness.events(EventKind.STOP_VERIFIED)
+    assert event.data == {"caller": "ann", "reason": "smoke", "verified": True}
+
+
 def test_stop_needs_no_lease_and_survives_a_restart(harness: DeviceHarness, make_device: MakeDevice) -> None:
     running = harness.running(harness.script("wait(600)"), epoch=1)
     harness.receive_stop()
     assert harness.end_code(running) == "stopped"
     stop = wait_for_state(harness, lambda state: state.mode is Mode.STOPPED).stop
     assert stop is not None
-    assert stop.caller == "bob"
+    assert (stop.caller, stop.verified) == ("bob (unverified)", False)
     harness.done(grant("eve"), epoch=2)
     for request in (move(0.2), harness.script("robot.home()")):
         assert harness.failed(request, epoch=2).code == "stopped"
@@ -191,6 +248,7 @@ def test_a_lease_from_before_a_restart_is_rejected(harness: DeviceHarness, make_
 
 
 def test_malformed_messages_are_counted_and_ignored(harness: DeviceHarness) -> None:
+    harness.done(grant(), epoch=1)
     for kind in (topics.CTL, topics.STOP, topics.CMD):
         for payload in (b"", b"\x00" * 10, b'{"id":1}', b"NaN"):
             harness.receive(kind, payload, "1")

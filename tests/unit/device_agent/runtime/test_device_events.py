@@ -70,7 +70,11 @@ def test_a_stop_in_motion_records_its_effects_once(harness: DeviceHarness) -> No
     for _ in range(50):
         harness.receive_stop()
     assert harness.end_code(command) == "stopped"
-    assert event(harness, EventKind.STOP_LATCHED).data == {"caller": "bob", "reason": "smoke"}
+    assert event(harness, EventKind.STOP_LATCHED).data == {
+        "caller": "bob (unverified)",
+        "reason": "smoke",
+        "verified": False,
+    }
     assert event(harness, EventKind.MOTION_HELD).data == {"code": "stopped", "epoch": 3}
     assert event(harness, EventKind.ACTION_LOST).data == {"code": "stopped", "epoch": 3}
     assert harness.events(EventKind.STOP_RESET) == [], "there was no Stop to reset"

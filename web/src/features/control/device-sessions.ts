@@ -18,7 +18,7 @@ export function useDeviceSessions(
   useEffect(() => {
     // Without a device, do not handle the Stop key.
     if (devices.length === 0) return undefined;
-    const created = devices.map((device) => new DeviceSession(api, fleet.link, device, account.name));
+    const created = devices.map((device) => new DeviceSession(api, fleet.link, device, account.id));
     setSessions(created);
     const reportVisibility = (): void => {
       for (const { watchers: watching } of created) watching.setVisible(document.visibilityState === "visible");

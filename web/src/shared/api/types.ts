@@ -76,6 +76,8 @@ export interface GrantedLease {
   expires_at: string;
   lease_ms: number;
   confirmed: boolean;
+  /** Authenticates the setpoints of this lease; secret. */
+  setpoint_key: string;
 }
 
 export type ActionStatus = AckStatus | "queued" | "created" | "published";

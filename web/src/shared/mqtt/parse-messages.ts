@@ -140,7 +140,7 @@ const state = object<Required<State>>({
   mode,
   epoch: count,
   ended_epoch: optional(count, 0),
-  stop: nullable(object<StopLatch>({ caller: text, reason: text, at_ms: count })),
+  stop: nullable(object<Required<StopLatch>>({ caller: text, reason: text, at_ms: count, verified: optional(flag, false) })),
   lease: nullable<LeaseState>(
     object<Required<LeaseState>>({
       holder: text,

@@ -10,6 +10,7 @@ export interface Presence {
   online: boolean;
   session: number;
   at_ms: number;
+  /** no control and format characters */
   software?: string;
 }
 
@@ -36,9 +37,11 @@ export interface Presence {
 export interface Description {
   /** letters, digits, _ and -, 1 to 64 of them */
   device: string;
+  /** no control and format characters */
   kind: string;
   /** letters, digits, _ and -, 1 to 64 of them */
   robot_type: string;
+  /** no control and format characters */
   label: string;
   joints?: Joint[];
   mimic_joints?: MimicJoint[];
@@ -67,7 +70,9 @@ export interface Description {
 
 /** One joint and the limits that the agent enforces. */
 export interface Joint {
+  /** no control and format characters */
   name: string;
+  /** no control and format characters */
   label: string;
   lower_rad: number;
   upper_rad: number;
@@ -86,7 +91,9 @@ export interface Joint {
  * multiplier: Position of `joint` divided by the position of `mimics`.
  */
 export interface MimicJoint {
+  /** no control and format characters */
   joint: string;
+  /** no control and format characters */
   mimics: string;
   multiplier?: number;
 }
@@ -101,7 +108,9 @@ export interface MimicJoint {
  * The rows cover the whole range of `depends_on`.
  */
 export interface PositionDependentLimit {
+  /** no control and format characters */
   joint: string;
+  /** no control and format characters */
   depends_on: string;
   table: [number, number, number][];
 }
@@ -117,6 +126,7 @@ export interface Stream {
 export interface Control {
   /** letters, digits, _ and -, 1 to 64 of them */
   name: string;
+  /** no control and format characters */
   label: string;
   unit?: string;
   lower: number;
@@ -158,6 +168,7 @@ export interface Diagnostic {
   /** letters, digits, _ and -, 1 to 64 of them */
   stream?: string;
   fields: string;
+  /** no control and format characters */
   label: string;
   unit?: string;
   advice?: string;
@@ -186,6 +197,7 @@ export interface Twin {
 
 /** One body of the tree. `parent` is its index in `Twin.bodies`, -1 for a root. */
 export interface Body {
+  /** no control and format characters */
   name: string;
   parent: number;
   position_m: [number, number, number];
@@ -200,6 +212,7 @@ export interface Body {
  * A joint that `follows` others has no motor: its position is the sum of multiplier times position of those joints.
  */
 export interface TwinJoint {
+  /** no control and format characters */
   name: string;
   kind: "hinge" | "slide";
   axis: [number, number, number];
@@ -249,11 +262,17 @@ export interface State {
 /** What the device is doing now. */
 export type Mode = "action" | "fault" | "holding" | "idle" | "stopped" | "streaming";
 
-/** Who stopped the device, and when. It stays until an authorized caller resets it. */
+/**
+ * Who stopped the device, and when. It stays until an authorized caller resets it.
+ *
+ * `verified`: a signed command names the caller. Otherwise only the broker vouches for the account.
+ */
 export interface StopLatch {
+  /** no control and format characters */
   caller: string;
   reason: string;
   at_ms: number;
+  verified?: boolean;
 }
 
 /**
@@ -267,6 +286,7 @@ export interface StopLatch {
  * request: Pending request for control. For display only: motion does not depend on it.
  */
 export interface LeaseState {
+  /** no control and format characters */
   holder: string;
   epoch: number;
   expires_in_ms: number;
@@ -278,6 +298,7 @@ export interface LeaseState {
 export interface OpenRequest {
   /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
+  /** no control and format characters */
   requester: string;
   expires_in_ms: number;
 }
@@ -286,13 +307,16 @@ export interface OpenRequest {
 export interface ActionState {
   /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
+  /** no control and format characters */
   kind: string;
+  /** no control and format characters */
   name?: string;
   progress?: number;
 }
 
 /** A fault that persists. */
 export interface Fault {
+  /** no control and format characters */
   code: string;
   message: string;
   since_ms: number;
@@ -351,6 +375,7 @@ export interface Event {
   /** letters, digits, _ and -, 1 to 64 of them */
   device: string;
   at_ms: number;
+  /** no control and format characters */
   kind: string;
   severity: "error" | "info" | "warning";
   message: string;
@@ -376,6 +401,7 @@ export type AckStatus = "accepted" | "cancelled" | "done" | "expired" | "failed"
 
 /** Why a command ended: a code for programs, and a message for people that names the remedy. */
 export interface Reason {
+  /** no control and format characters */
   code: string;
   message: string;
 }
@@ -405,6 +431,7 @@ export interface MovePose {
   position_m: [number, number, number];
   quaternion?: [number, number, number, number] | null;
   rpy_rad?: [number, number, number] | null;
+  /** no control and format characters */
   frame?: string;
   /** share of each joint's velocity limit */
   speed?: number;
@@ -505,7 +532,7 @@ export interface SetControl {
 }
 
 /**
- * `ctl/{epoch}`: one streamed setpoint. The newest is used; `sequence` starts at 1 in each lease.
+ * One streamed setpoint; the body of `setpoints.Tagged`. The newest is used; `sequence` rises in each lease.
  *
  * Attributes:
  * echo_tick_ms: `tick_ms` of the newest telemetry that the operator has received. Its age on the robot's own
@@ -536,6 +563,7 @@ export interface JogTarget {
   kind: "jog";
   linear_m_s?: [number, number, number];
   angular_rad_s?: [number, number, number];
+  /** no control and format characters */
   frame?: string;
   tool?: boolean;
 }
@@ -548,10 +576,21 @@ export interface DriveTarget {
   turn_rad_s?: number;
 }
 
-/** `stop`: latch Stop now. Needs no lease and no signature; the broker restricts the publishers. */
+/**
+ * `stop/{author}`: latch Stop now. Needs no lease and no signature, and unknown fields do not prevent it.
+ *
+ * The last topic level is the author's account; the broker allows each account only its own. The device shows this
+ * author as unverified until the signed `stop_device` command arrives.
+ */
 export interface Stop {
   /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
-  caller: string;
   reason?: string;
+}
+
+/** HMAC-SHA256 with the lease's `setpoint_key` over `telescope/v1/setpoint` + line feed + the topic + line feed + the exact bytes of `body`; the first 16 bytes. */
+export interface Tagged {
+  /** The tag in hexadecimal. */
+  tag: string;
+  body: Setpoint;
 }

@@ -11,7 +11,8 @@ export interface DeviceTopics {
   cam: (name: string) => string;
   event: string;
   ack: string;
-  stop: string;
+  /** Stop by the account `author`. */
+  stop: (author: string) => string;
   ctl: (epoch: number) => string;
 }
 
@@ -26,7 +27,7 @@ export function deviceTopics(base: string): DeviceTopics {
     cam: (name) => `${base}/cam/${name}`,
     event: `${base}/event`,
     ack: `${base}/ack`,
-    stop: `${base}/stop`,
+    stop: (author) => `${base}/stop/${author}`,
     ctl: (epoch) => `${base}/ctl/${epoch}`,
   };
 }

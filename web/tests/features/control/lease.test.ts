@@ -5,15 +5,18 @@ import type { ControlRequestState } from "../../../src/features/control/model/co
 import { Watchers } from "../../../src/features/control/model/watchers";
 import { deliver, device, ends, pass, server } from "../../support/console";
 import { FakeLink } from "../../support/fake-link";
+import { sealed } from "../../../src/shared/mqtt/sealed-setpoint";
+import type { Tagged } from "../../../src/shared/mqtt/protocol.generated";
 import { list, none, ok, problem, unreachable, type Answer } from "../../support/fake-server";
 import { DEVICE, TOPIC, state, telemetry } from "../../support/messages";
 
 const LEASE = `/devices/${DEVICE}/lease`;
 const REQUEST = `${LEASE}/requests/r1`;
+const KEY = "00".repeat(32);
 const EXPIRES = "2030-01-01T00:00:00.000Z";
 
 function granted(epoch: number, confirmed = true): Answer {
-  return ok({ epoch, holder: "Ann", expires_at: EXPIRES, lease_ms: LEASE_MS, confirmed } satisfies GrantedLease);
+  return ok({ epoch, holder: "Ann", expires_at: EXPIRES, lease_ms: LEASE_MS, confirmed, setpoint_key: KEY } satisfies GrantedLease);
 }
 
 function request(outcome: ControlRequestInfo["outcome"] = "open"): ControlRequestInfo {
@@ -141,7 +144,9 @@ describe("control of a device", () => {
     control.streamer.value?.setTarget("elbow", 1);
     const [first] = setpoints.published;
     expect(first?.topic).toBe(`${TOPIC}/ctl/5`);
-    const { sent_ms, sequence } = first?.message as { sent_ms: number; sequence: number };
+    const { tag, body } = first?.message as Tagged;
+    const { sent_ms, sequence } = body;
+    expect(sealed(body, KEY, `${TOPIC}/ctl/5`).tag).toBe(tag);
     await pass(30);
     deliver("tele/joints", telemetry({ setpoint_sequence: sequence, setpoint_sent_ms: sent_ms }));
     await pass(1);

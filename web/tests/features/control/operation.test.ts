@@ -18,7 +18,7 @@ let setpoints: FakeLink;
 
 beforeEach(() => {
   setpoints = new FakeLink();
-  const lease = { epoch: 5, holder: "Demo", expires_at: "2030-01-01T00:00:00.000Z", lease_ms: LEASE_MS, confirmed: true };
+  const lease = { epoch: 5, holder: "Demo", expires_at: "2030-01-01T00:00:00.000Z", lease_ms: LEASE_MS, confirmed: true, setpoint_key: "00".repeat(32) };
   server.on(`POST ${LEASE}`, ok(lease));
   server.on(`GET ${LEASE}`, ok({ lease: null }));
   control = new Control(server.api, device, () => setpoints);
@@ -28,18 +28,18 @@ beforeEach(() => {
 describe("stop", () => {
   let stop: StopSwitch;
   const latched = (): void => deliver("tele/joints", telemetry({ mode: "stopped" }));
-  const stops = (): object[] => link.published.filter(({ topic }) => topic === `${TOPIC}/stop`).map(({ message }) => message);
+  const stops = (): object[] => link.published.filter(({ topic }) => topic === `${TOPIC}/stop/account1`).map(({ message }) => message);
 
   beforeEach(() => {
     server.on(`POST ${STOP}`, ok({ confirmed: false }));
-    stop = new StopSwitch(server.api, device, link, "Demo");
+    stop = new StopSwitch(server.api, device, link, "account1");
     ends.push(() => stop.dispose());
   });
 
   it("is sent over MQTT and HTTP, and republished with a warning until the robot confirms it", async () => {
     stop.press("test");
     expect(stop.state.value).toEqual({ kind: "sending", overdue: false });
-    expect(stops()).toMatchObject([{ caller: "Demo", reason: "test" }]);
+    expect(stops()).toMatchObject([{ reason: "test" }]);
     expect(server.callsTo(`POST ${STOP}`)).toHaveLength(1);
     await pass(1_500);
     expect(stop.state.value).toEqual({ kind: "sending", overdue: true });

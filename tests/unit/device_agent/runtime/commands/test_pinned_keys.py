@@ -12,6 +12,7 @@ from device_agent.protocol.security import signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.errors import Refused
+from tests.harness.agent.pinned_keys import IDENTITY
 
 FIRST, SECOND, THIRD = (signing.generate() for _ in range(3))
 ENDS_MS = 5000
@@ -41,7 +42,7 @@ class PinsFixture:
     def load(self) -> PinnedKeys:
         pairing = self.store.pairing()
         assert pairing is not None
-        return PinnedKeys(pairing, save=self.store.save_pairing, now_ms=lambda: self.now_ms)
+        return PinnedKeys(pairing, identity=IDENTITY, save=self.store.save_pairing, now_ms=lambda: self.now_ms)
 
 
 @pytest.fixture

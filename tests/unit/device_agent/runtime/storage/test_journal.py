@@ -88,6 +88,12 @@ def test_epochs_and_latch_persist_and_epochs_never_decrease(open_journal: OpenJo
     assert after.device("other").epoch == 0
 
 
+def test_a_latch_of_another_version_still_holds_the_device(open_journal: OpenJournal) -> None:
+    journal = open_journal()
+    journal.save_latch("arm", StopLatch(caller="line\nbreak", reason="", at_ms=1))
+    assert journal.device("arm").latch == StopLatch(caller="unknown (unverified)", reason="", at_ms=0)
+
+
 def test_session_numbers_increase(open_journal: OpenJournal) -> None:
     numbers = [journal.next_session() for journal in (open_journal(), open_journal()) for _ in range(2)]
     assert numbers == [1, 2, 3, 4]

@@ -58,7 +58,7 @@ ELSEWHERE = "ts/v1/other/agentaaaaa"
                 f"{OWN}/a/b/c/state",
             ],
         ),
-        ("RetainPublish", "topic", [f"{OWN}/arm/state"], [f"{OTHER}/arm/state"]),
+        ("RetainPublish", "topic", [f"{OWN}/arm/state"], [f"{OTHER}/arm/state", f"{OWN}/arm/tele/joints"]),
         (
             "Subscribe",
             "topicfilter",

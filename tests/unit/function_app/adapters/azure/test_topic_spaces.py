@@ -29,8 +29,8 @@ def person(publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> Gr
 def watching(*devices: str, spaces: tuple[str, ...] = (), stops: tuple[str, ...] = ()) -> Grant:
     subscribe = [topic for space in spaces for topic in grants.device_subscriptions(space, "+", "+")]
     subscribe += [topic for name in devices for topic in grants.device_subscriptions("room", "agentaaaaa", name)]
-    publish = [f"ts/v1/{space}/+/+/stop" for space in spaces]
-    publish += [f"ts/v1/room/agentaaaaa/{name}/stop" for name in stops]
+    publish = [f"ts/v1/{space}/+/+/stop/account" for space in spaces]
+    publish += [f"ts/v1/room/agentaaaaa/{name}/stop/account" for name in stops]
     return person(tuple(publish), tuple(dict.fromkeys(subscribe)))
 
 
@@ -65,7 +65,7 @@ ANY_LEVEL = LEVEL | st.sampled_from(["tele", "desc", "twin", "x", "7", "8", "+",
 PATTERN = st.one_of(
     st.lists(ANY_LEVEL, min_size=1, max_size=6).map(lambda levels: "/".join(["ts", "v1", *levels])),
     st.sampled_from(sorted({each for grant in GRANTS for each in (*grant.publish, *grant.subscribe)})),
-    st.sampled_from(["#", "+/+/#", "ts/#", "$SYS/#", "ts/v1/#", "ts/v1/+/+/+/stop", "ts/v1/+/+/+/ctl/+"]),
+    st.sampled_from(["#", "+/+/#", "ts/#", "$SYS/#", "ts/v1/#", "ts/v1/+/+/+/stop/+", "ts/v1/+/+/+/ctl/+"]),
 )
 
 
@@ -89,11 +89,12 @@ def test_every_topic_of_a_grant_is_allowed() -> None:
         watching("a", "b", "c", "d", "e"),
         watching(stops=("a", "b", "c", "d", "e", "f", "g")),
         person(("ts/v1/a/b/c/ctl/1", "ts/v1/a/b/c/ctl/2")),
-        person(("ts/v1/+/+/+/stop",)),
+        person(("ts/v1/+/+/+/stop/account",)),
+        person(("ts/v1/space/+/+/stop/+",)),
         person(subscribe=("#",)),
         person(subscribe=("ts/v1/space/+/+/state",)),
         person(("ts/v1/space/agent/arm/cmd",)),
-        person(("ts/v1/space/${client.attributes.kind}/arm/stop",)),
+        person(("ts/v1/space/${client.attributes.kind}/arm/stop/account",)),
         msgspec.structs.replace(AGENT, principal="account:x:y"),
         msgspec.structs.replace(AGENT, publish=AGENT.publish[1:]),
         grants.gateway_grant(client_id="s", token_id="t", lifetime_s=1),
@@ -107,7 +108,7 @@ def test_a_grant_that_cannot_be_expressed_exactly_is_refused(grant: Grant) -> No
 
 def test_the_topic_space_of_the_functions_has_no_clients() -> None:
     space = topic_spaces.spaces()[topic_spaces.FUNCTIONS_SPACE]
-    assert {f"ts/v1/+/+/+/{kind}" for kind in ("cmd", "stop", "state", "ack")} <= set(space)
+    assert {f"ts/v1/+/+/+/{kind}" for kind in ("cmd", "stop/+", "state", "ack")} <= set(space)
     assert not any(
         covers(template, "ts/v1/s/a/arm/ctl/1") or covers(template, "ts/v1/s/a/arm/cam/x") for template in space
     )

@@ -1,6 +1,7 @@
 """Acquiring, renewing, losing and releasing control of a device."""
 
 from device_agent.protocol import GrantLease, ReleaseLease
+from device_agent.protocol.security import setpoints
 from function_app.ports.broker_access import Credentials
 from tests.fakes.agent import Robot
 from tests.fakes.broker import MemoryBroker
@@ -13,7 +14,9 @@ def test_a_lease_is_acquired_confirmed_renewed_and_released(anna: Person, robot:
     assert (acquired["epoch"], acquired["holder"], acquired["lease_ms"]) == (1, "anna", 5_000)
     assert acquired["confirmed"] is True
     (grant,) = robot.received(GrantLease)
-    assert (grant.epoch, grant.request) == (1, GrantLease(holder="anna", lease_ms=5_000))
+    assert isinstance(grant.request, GrantLease)
+    pairing = grant.request.pairing
+    assert (grant.epoch, grant.request) == (1, GrantLease(holder="anna", lease_ms=5_000, pairing=pairing))
     renewed = anna.take_lease(robot.device, epoch=1, lease_ms=60_000).json()
     assert (renewed["epoch"], renewed["confirmed"]) == (1, True)
     assert renewed["expires_at"] > acquired["expires_at"]
@@ -57,7 +60,24 @@ def test_a_lease_is_unconfirmed_without_an_ack_of_the_robot(anna: Person, robot:
     robot.fail(robot.received(GrantLease)[2].id, "stopped", "Reset it first.")
     answer = call().json()
     assert answer.pop("expires_at")
+    assert answer.pop("setpoint_key")
     assert answer == {"epoch": 3, "holder": "anna", "lease_ms": 30_000, "confirmed": False}
+
+
+def test_the_holder_gets_the_key_that_the_agent_derives_from_the_grant(anna: Person, robot: Robot) -> None:
+    keys = []
+    for number, epoch in enumerate((None, 1, None)):
+        answer = anna.take_lease(robot.device, epoch=epoch)
+        assert answer.headers["cache-control"] == "no-store"
+        grant = robot.received(GrantLease)[number]
+        assert isinstance(grant.request, GrantLease)
+        (cloud_key,) = robot._keys.values()
+        topic = f"ts/v1/{robot.space}/{robot.id}/arm/ctl/{grant.epoch}"
+        key = setpoints.lease_key(robot.key, cloud_key, topic=topic, pairing=grant.request.pairing)
+        assert answer.json()["setpoint_key"] == key.hex()
+        keys.append(key)
+    assert keys[0] == keys[1] != keys[2], "a renewal keeps the key, a new lease has another one"
+    assert "setpoint_key" not in str(anna.get(f"/devices/{robot.device}/lease").json())
 
 
 def test_invalid_requests_are_refused(anna: Person, robot: Robot) -> None:

@@ -34,7 +34,7 @@ def test_viewing_covers_every_device_of_the_account_and_no_other(
         conns = [topics.conn(each.space, each.id) for each in (robot, second)]
         subscribe = [*conns, *(f"{base}/{kind}" for base in bases for kind in VIEWED)]
         assert sorted(issued["subscribe"]) == sorted(subscribe)
-        assert sorted(issued["publish"]) == sorted(f"{base}/stop" for base in bases)
+        assert sorted(issued["publish"]) == sorted(f"{base}/stop/{anna.account}" for base in bases)
         tcp = {"host": "127.0.0.1", "port": 1, "tls": False, "certificate_after_ms": None}
         assert (issued["lifetime_s"], issued["tcp"]) == (900, tcp)
         with connect(broker, issued) as page:
@@ -47,10 +47,10 @@ def test_viewing_covers_every_device_of_the_account_and_no_other(
             expected = [robot.topic(topics.EVENT), second.topic(topics.EVENT, "right")]
             assert [message.topic for message in page.pending()] == expected
             received(robot)
-            page.publish(f"{bases[0]}/stop", b'{"id":"s1","caller":"anna"}')
-            for kind in ("ctl/1", "cmd", "state"):
+            page.publish(f"{bases[0]}/stop/{anna.account}", b'{"id":"s1"}')
+            for kind in ("ctl/1", "cmd", "state", "stop", "stop/another"):
                 page.publish(f"{bases[0]}/{kind}", b"{}")
-            assert received(robot) == [f"{bases[0]}/stop"]
+            assert received(robot) == [f"{bases[0]}/stop/{anna.account}"]
             assert robot.stops
 
 
@@ -83,7 +83,7 @@ def test_an_agent_gets_its_own_devices(robot: Robot) -> None:
     issued = robot.request("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
     own = f"ts/v1/{robot.space}/{robot.id}"
     assert (issued["client_id"], issued["lifetime_s"]) == (robot.id, 3600)
-    assert sorted(issued["subscribe"]) == sorted([f"{own}/+/cmd", f"{own}/+/ctl/+", f"{own}/+/stop"])
+    assert sorted(issued["subscribe"]) == sorted([f"{own}/+/cmd", f"{own}/+/ctl/+", f"{own}/+/stop/+"])
     published = ("desc", "state", "event", "ack", "desc/+", "tele/+", "late/+", "cam/+")
     assert sorted(issued["publish"]) == sorted([f"{own}/conn", *(f"{own}/+/{kind}" for kind in published)])
 

@@ -45,7 +45,7 @@ class TestMessages:
             f"ts/v1/{robot.space}/{other.id}/arm/state",
             f"{own}/leg/state",
             f"{own}/arm/cmd",
-            f"{own}/arm/stop",
+            f"{own}/arm/stop/account",
             f"{own}/arm/ctl/1",
             f"{own}/arm/cam/wrist",
             f"{own}/arm/tele",

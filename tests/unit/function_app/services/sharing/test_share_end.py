@@ -23,7 +23,7 @@ def test_viewing_credentials_of_a_shared_device_cover_only_that_device(
         classes = ("desc", "desc/twin", "state", "tele/+", "cam/+", "event", "ack")
         expected = {topics.conn(second.space, second.id), *(f"{base}/{kind}" for kind in classes)}
         assert set(issued["subscribe"]) == expected
-        assert issued["publish"] == [f"{base}/stop"]
+        assert issued["publish"] == [f"{base}/stop/{bert.account}"]
         with connected(broker, bert) as page:
             assert page.subscribe(*issued["subscribe"][:8]) == [1] * 8
             for topic in (f"{base}/#", f"ts/v1/{second.space}/{second.id}/leg/state"):
@@ -34,7 +34,7 @@ def test_viewing_credentials_of_a_shared_device_cover_only_that_device(
             while (message := page.receive()).topic.endswith("/conn"):
                 pass
             assert message.topic == f"{base}/event"
-            page.publish(f"{base}/stop", b'{"id":"s1","caller":"bert"}')
+            page.publish(f"{base}/stop/{bert.account}", b'{"id":"s1"}')
             assert second.stops
 
 

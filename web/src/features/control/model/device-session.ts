@@ -19,12 +19,12 @@ export class DeviceSession {
   readonly watchers: Watchers;
   readonly #unwatch: () => void;
 
-  /** `by`: the name that is reported as the caller of Stop. */
-  constructor(api: Api, link: Link, device: DeviceStore, by: string) {
+  /** `author`: the account that sends Stop. */
+  constructor(api: Api, link: Link, device: DeviceStore, author: string) {
     this.device = device;
     this.#unwatch = device.watchDetails();
     this.control = new Control(api, device);
-    this.stop = new StopSwitch(api, device, link, by);
+    this.stop = new StopSwitch(api, device, link, author);
     this.actions = new ActionRunner(api, device);
     this.commandTrace = new CommandTrace(device, this.control, this.actions);
     this.#samples = new LatencySamples(api, device.id, this.control.roundTrip);

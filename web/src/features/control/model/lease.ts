@@ -8,6 +8,7 @@ import type { Api } from "../../../shared/api/client";
 import { ControlRequest } from "./control-request";
 import { ApiError, sentence } from "../../../shared/api/http";
 import { now } from "../../../shared/lib/clock";
+import { sealed } from "../../../shared/mqtt/sealed-setpoint";
 import { MqttLink, type Link, type LinkStatus } from "../../../shared/mqtt/mqtt-link";
 
 export const LEASE_MS = 30_000;
@@ -45,6 +46,7 @@ export class Control {
   #expiry: ReturnType<typeof setTimeout> | undefined;
   #cleanups: (() => void)[] = [];
   #epochReported = false;
+  #setpointKey = "";
   /** The new operator during a handover. The end of this lease then does not count as a loss. */
   #handingTo: string | null = null;
   readonly #response = signal<ResponseState>({ kind: "none" });
@@ -171,7 +173,7 @@ export class Control {
     const streamer = new SetpointStreamer({
       epoch,
       joints: this.#device.description.value?.joints ?? [],
-      send: (setpoint) => link.publish(topic, setpoint, 0),
+      send: (setpoint) => link.publish(topic, sealed(setpoint, this.#setpointKey, topic), 0),
       telemetry: () => this.#device.telemetry.value,
     });
     this.#link = link;
@@ -222,6 +224,7 @@ export class Control {
   }
 
   #renewed(granted: GrantedLease, requestedAt: number): void {
+    this.#setpointKey = granted.setpoint_key;
     clearTimeout(this.#expiry);
     this.#expiry = setTimeout(
       () => this.#lose("It expired because the server could not be reached in time to renew it."),

@@ -32,7 +32,7 @@ export class StopSwitch {
   readonly #api: Api;
   readonly #device: DeviceStore;
   readonly #link: Link;
-  readonly #caller: string;
+  readonly #author: string;
   readonly #pressed = signal<Pressed | null>(null);
   readonly #resetting = signal(false);
   readonly #error = signal<string | null>(null);
@@ -51,11 +51,11 @@ export class StopSwitch {
     return pressed === null ? { kind: "clear" } : { kind: "unconfirmed" };
   });
 
-  constructor(api: Api, device: DeviceStore, link: Link, by: string) {
+  constructor(api: Api, device: DeviceStore, link: Link, author: string) {
     this.#api = api;
     this.#device = device;
     this.#link = link;
-    this.#caller = by;
+    this.#author = author;
     this.#disposeEffect = effect(() => {
       const latest = device.telemetry.value;
       const pressed = this.#pressed.value;
@@ -83,7 +83,7 @@ export class StopSwitch {
     const at = now();
     this.#error.value = null;
     this.#pressed.value = { kind: "sending", at, overdue: false };
-    const message: Stop = { id: newId(), caller: this.#caller.slice(0, 200), reason };
+    const message: Stop = { id: newId(), reason };
     clearInterval(this.#timer);
     this.#timer = setInterval(() => {
       const age = now() - at;
@@ -126,7 +126,7 @@ export class StopSwitch {
 
   #publish(message: Stop): void {
     // If the broker is unreachable, the HTTP call is the second channel; its error is displayed.
-    this.#link.publish(this.#device.topics.stop, message, 1).catch(() => undefined);
+    this.#link.publish(this.#device.topics.stop(this.#author), message, 1).catch(() => undefined);
   }
 
   #finish(pressed: Pressed | null): void {
