@@ -246,10 +246,12 @@ class _Epoch(int):
 class NoCheck(LeaseGate):
     """A gate that accepts every holder, past or present."""
 
-    def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
+    def grant(
+        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: tuple[bytes, ...] = ()
+    ) -> None:
         """Accept every grant."""
         self.epoch, self.burned = epoch, 0
-        self._lease = Lease(holder, _Epoch(epoch), now_s + lease_s, reason)
+        self._lease = Lease(holder, _Epoch(epoch), now_s + lease_s, reason, keys)
         self._lease.epoch.accepted = lambda _: True  # type: ignore[attr-defined]
 
     def fence(self, epoch: int) -> None:
@@ -272,11 +274,13 @@ class ExpiryOnly(LeaseGate):
         super().__init__(epoch=epoch, burned=burned)
         self._until_s: dict[object, float] = {}
 
-    def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
+    def grant(
+        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: tuple[bytes, ...] = ()
+    ) -> None:
         """Accept every grant."""
         self._until_s[epoch] = now_s + lease_s
         self.epoch, self.burned = max(self.epoch, epoch), 0
-        self._lease = Lease(holder, epoch, max(self._until_s.values()), reason)
+        self._lease = Lease(holder, epoch, max(self._until_s.values()), reason, keys)
 
     def fence(self, epoch: int) -> None:
         """Reject nothing."""

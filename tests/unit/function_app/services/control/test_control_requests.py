@@ -4,9 +4,9 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from msgspec.structs import replace
+from msgspec import structs
 
-from device_agent.protocol import GrantLease, Mode, ReleaseLease, RequestControl, State, WithdrawRequest
+from device_agent.protocol import Command, GrantLease, Mode, ReleaseLease, RequestControl, State, WithdrawRequest
 from function_app.domain.identity.accounts import Role
 from function_app.ports.broker_access import Credentials
 from function_app.ports.tables import StoreError
@@ -26,6 +26,11 @@ def _lease(anna: Person, robot: Robot) -> None:
 def other(cloud: Cloud) -> Person:
     """Another session of Anna's."""
     return cloud.sign_in("anna")
+
+
+def without_pairing(command: Command) -> GrantLease:
+    assert isinstance(command.request, GrantLease)
+    return structs.replace(command.request, pairing="")
 
 
 def request_control(person: Person, robot: Robot, **options: Any) -> Any:
@@ -76,7 +81,7 @@ def test_an_accepted_request_gives_the_requester_the_next_epoch(
     assert anna.post(f"{request}/accept").json()["epoch"] == 2, "accepting is idempotent"
     grants = robot.received(GrantLease)
     assert [grant.epoch for grant in grants] == [1, 2]
-    assert replace(grants[1].request, pairing="") == GrantLease(holder="anna", lease_ms=45_000)
+    assert without_pairing(grants[1]) == GrantLease(holder="anna", lease_ms=45_000)
     shown = lease(other, robot)
     assert (shown["epoch"], shown["mine"], shown["request"]) == (2, True, None)
     assert outcome(other, request) == "accepted"
@@ -186,7 +191,7 @@ def test_an_owner_takes_over_with_a_reason(anna: Person, other: Person, robot: R
     answer = other.take_lease(robot.device, take_over=True, reason="needed in the lab").json()
     assert (answer["epoch"], answer["confirmed"]) == (2, True)
     grant = robot.received(GrantLease)[-1]
-    assert replace(grant.request, pairing="") == GrantLease(holder="anna", lease_ms=30_000, reason="needed in the lab")
+    assert without_pairing(grant) == GrantLease(holder="anna", lease_ms=30_000, reason="needed in the lab")
     assert lease(anna, robot)["reason"] == "needed in the lab"
     assert outcome(other, request) == "ended"
     problem(anna.take_lease(robot.device, epoch=1), 409, "lease-lost")
