@@ -53,6 +53,7 @@ class MessagingServices(HealthServices):
         return PresenceIngest(
             tables=self.tables,
             events=self.events,
+            audit_log=self.audit_log,
             reported_faults=self.reported_faults,
             key_announcer=KeyAnnouncer(keys=self.keys, command_sender=self.command_sender),
             clock=self.clock,

@@ -6,13 +6,17 @@ import msgspec
 
 from device_agent.protocol import Description, Event, Presence, State, codec, topics
 from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.events import EventKind
+from device_agent.protocol.fields import printable
 from device_agent.protocol.topics import Topic
+from function_app.domain.audit.hash_chain import CLOUD, Entry
 from function_app.domain.common.ids import device_id
 from function_app.domain.common.json_depth import MAX_LEVELS, too_deep
 from function_app.domain.common.timestamps import LAST_MS
 from function_app.domain.devices.devices import Agent, LastState, Link, Transport, newer_link
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.health.reported_faults import ReportedFaults
 from function_app.services.messaging.key_announcer import KeyAnnouncer
 from function_app.services.storage import records
@@ -29,12 +33,14 @@ class PresenceIngest:
         *,
         tables: Tables,
         events: EventLog,
+        audit_log: AuditLog,
         reported_faults: ReportedFaults,
         key_announcer: KeyAnnouncer,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._events = events
+        self._audit_log = audit_log
         self._reported_faults = reported_faults
         self._key_announcer = key_announcer
         self._clock = clock
@@ -90,4 +96,16 @@ class PresenceIngest:
             raise ProtocolError(f"the event's data are nested more than {MAX_LEVELS} levels deep")
         if event.at_ms > LAST_MS:
             raise ProtocolError("the event's `at_ms` is not a time of milliseconds since 1970")
-        await self._events.add(device_id(topic.agent, topic.device), agent.pairing, msgspec.to_builtins(event))
+        device = device_id(topic.agent, topic.device)
+        await self._events.add(device, agent.pairing, msgspec.to_builtins(event))
+        if event.kind == EventKind.STOP_LATCHED:
+            # Also a Stop that reached the device over the broker, past the functions.
+            await self._audit_log.append_all(agent.account or CLOUD, [_stop_entry(device, event)])
+
+
+def _stop_entry(device: str, event: Event) -> Entry:
+    """The audit record of a Stop latch. The actor is the agent's report; ``verified`` is false without a signature."""
+    caller, reason = (printable(str(event.data.get(name, ""))) for name in ("caller", "reason"))
+    data: dict[str, object] = {"message": printable(event.message), "caller": caller, "reason": reason}
+    data["verified"] = event.data.get("verified") is True
+    return Entry(f"{device}/{event.id}", event.at_ms, event.kind, target=device, actor=caller, data=data)

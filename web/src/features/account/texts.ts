@@ -154,6 +154,7 @@ export const texts = {
       "control-request-withdrawn": "Control request withdrawn",
       "control-request-expired": "Control request expired",
       "stop-ordered": "Stop",
+      "stop-latched": "Stop at the device",
       "stop-reset-ordered": "Stop reset",
       "command-rejected": "Command rejected",
     } as Readonly<Record<string, string>>,

@@ -5,12 +5,15 @@ from typing import Any
 
 import pytest
 
+from device_agent.protocol import Event, topics
 from function_app.domain.audit.hash_chain import CLOUD, Head, entry
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import Conflict
 from function_app.services.audit.audit_log import ANCHOR_MS, anchors
 from function_app.services.storage import records as store
+from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import API, Cloud, Person, problem
+from tests.harness.network.brokers import wait_until
 
 OWNER = "owner"
 CALLER = Identity(OWNER, "anna", "s")
@@ -50,6 +53,22 @@ class TestWhatIsRecorded:
         ]
         stop = next(item for item in items if item["event"] == "stop-ordered")
         assert (stop["actor"], stop["account"], stop["data"]["reason"]) == ("anna", anna.account, "look out")
+        assert verdict(cloud, anna.account) == ""
+
+    def test_a_stop_that_the_device_reports_is_recorded_once_with_its_unverified_author(
+        self, cloud: Cloud, anna: Person, robot: Robot
+    ) -> None:
+        data = {"caller": "eve\n\u202eforged", "reason": "smoke", "verified": False}
+        event = Event(
+            id="e1", device="arm", at_ms=5, kind="stop-latched", severity="warning", message="stopped by eve", data=data
+        )
+        for _ in range(2):
+            robot.publish(robot.topic(topics.EVENT), event)
+        wait_until(lambda: "stop-latched" in kinds(anna), "the record")
+        items = anna.get("/accounts/me/audit").json()["items"]
+        (stop,) = [item for item in items if item["event"] == "stop-latched"]
+        assert (stop["actor"], stop["account"], stop["target"]) == ("eve\ufffd\ufffdforged", "", robot.device)
+        assert stop["data"] | {"message": ""} == {**data, "caller": stop["actor"], "message": ""}
         assert verdict(cloud, anna.account) == ""
 
     def test_sign_ins_are_recorded_without_secrets(self, cloud: Cloud) -> None:
