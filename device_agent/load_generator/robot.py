@@ -43,6 +43,7 @@ from device_agent.protocol import (
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.fields import printable
 from device_agent.protocol.security import setpoints, signing
+from device_agent.protocol.state import unverified
 from device_agent.runtime.authority.authority import Authority, Reservation
 from device_agent.runtime.authority.control_request import PendingControlRequest
 from device_agent.runtime.authority.event_recorder import EventRecord, event_message
@@ -243,8 +244,8 @@ class SimulatedRobot:
                 self._accept_setpoint(parsed.name, topic, payload)
             elif parsed.kind == topics.STOP:
                 stop = codec.decode(payload, Stop)
-                caller = f"{parsed.name} (unverified)"
-                self._authority.stop(StopLatch(caller=caller, reason=printable(stop.reason[:2000]), at_ms=wall_ms()))
+                reason = printable(stop.reason[:2000])
+                self._authority.stop(StopLatch(caller=unverified(parsed.name), reason=reason, at_ms=wall_ms()))
         except (ProtocolError, SignatureError, Refused):
             self.refused += 1
 

@@ -6,6 +6,8 @@ from msgspec import Struct
 
 from device_agent.protocol.fields import Count, Id, Label, Milliseconds, Text
 
+_UNVERIFIED = " (unverified)"
+
 
 class Presence(Struct, frozen=True, kw_only=True):
     """``conn``: whether the agent is connected to the broker. Retained, and the MQTT will.
@@ -40,6 +42,11 @@ class StopLatch(Struct, frozen=True, kw_only=True):
     reason: Text
     at_ms: Milliseconds
     verified: bool = False
+
+
+def unverified(author: str) -> str:
+    """How an author is shown whom no signature names."""
+    return author if author.endswith(_UNVERIFIED) else f"{author or 'unknown'}{_UNVERIFIED}"
 
 
 class OpenRequest(Struct, frozen=True, kw_only=True):

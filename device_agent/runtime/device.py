@@ -24,6 +24,7 @@ from device_agent.protocol.events import EventKind
 from device_agent.protocol.fields import printable
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.security import setpoints
+from device_agent.protocol.state import unverified
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.executor import ActionExecutor
 from device_agent.runtime.actions.script_policy import ScriptPolicy
@@ -247,7 +248,7 @@ class Device:
 
     def _stop(self, author: str, stop: Stop) -> None:
         """Latch Stop. Only the broker vouches for the author, so it is shown as unverified."""
-        caller = f"{author} (unverified)" if author else "unknown (unverified)"
+        caller = unverified(author)
         reason = printable(stop.reason[:MAX_REASON])
         self._controller.stop(StopLatch(caller=caller, reason=reason, at_ms=wall_ms()))
         self._wake()

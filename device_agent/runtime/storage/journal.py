@@ -16,6 +16,7 @@ from typing import Any
 
 from device_agent.protocol import Ack, AckStatus, Reason, StopLatch, codec
 from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.state import unverified
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS commands (
@@ -243,4 +244,4 @@ def _latch(payload: bytes) -> StopLatch:
     try:
         return codec.decode(payload, StopLatch)
     except ProtocolError:
-        return StopLatch(caller="unknown (unverified)", reason="", at_ms=0)
+        return StopLatch(caller=unverified(""), reason="", at_ms=0)

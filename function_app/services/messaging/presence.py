@@ -8,6 +8,7 @@ from device_agent.protocol import Description, Event, Presence, State, codec, to
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.fields import printable
+from device_agent.protocol.state import unverified
 from device_agent.protocol.topics import Topic
 from function_app.domain.audit.hash_chain import CLOUD, Entry
 from function_app.domain.common.ids import device_id
@@ -104,8 +105,10 @@ class PresenceIngest:
 
 
 def _stop_entry(device: str, event: Event) -> Entry:
-    """The audit record of a Stop latch. The actor is the agent's report; ``verified`` is false without a signature."""
+    """The audit record of a reported Stop. Its author is unverified: a broker could have changed the report.
+
+    A Stop that the functions have sent has a record of its own.
+    """
     caller, reason = (printable(str(event.data.get(name, ""))) for name in ("caller", "reason"))
-    data: dict[str, object] = {"message": printable(event.message), "caller": caller, "reason": reason}
-    data["verified"] = event.data.get("verified") is True
-    return Entry(f"{device}/{event.id}", event.at_ms, event.kind, target=device, actor=caller, data=data)
+    data = {"message": printable(event.message), "caller": unverified(caller), "reason": reason, "verified": False}
+    return Entry(f"{device}/{event.id}", event.at_ms, event.kind, target=device, actor=unverified(caller), data=data)

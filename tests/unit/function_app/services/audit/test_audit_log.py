@@ -58,7 +58,7 @@ class TestWhatIsRecorded:
     def test_a_stop_that_the_device_reports_is_recorded_once_with_its_unverified_author(
         self, cloud: Cloud, anna: Person, robot: Robot
     ) -> None:
-        data = {"caller": "eve\n\u202eforged", "reason": "smoke", "verified": False}
+        data = {"caller": "eve\n\u202eforged", "reason": "smoke", "verified": True}
         event = Event(
             id="e1", device="arm", at_ms=5, kind="stop-latched", severity="warning", message="stopped by eve", data=data
         )
@@ -67,8 +67,9 @@ class TestWhatIsRecorded:
         wait_until(lambda: "stop-latched" in kinds(anna), "the record")
         items = anna.get("/accounts/me/audit").json()["items"]
         (stop,) = [item for item in items if item["event"] == "stop-latched"]
-        assert (stop["actor"], stop["account"], stop["target"]) == ("eve\ufffd\ufffdforged", "", robot.device)
-        assert stop["data"] | {"message": ""} == {**data, "caller": stop["actor"], "message": ""}
+        assert (stop["actor"], stop["account"]) == ("eve\ufffd\ufffdforged (unverified)", "")
+        expected = {"message": "stopped by eve", "caller": stop["actor"], "reason": "smoke", "verified": False}
+        assert (stop["target"], stop["data"]) == (robot.device, expected)
         assert verdict(cloud, anna.account) == ""
 
     def test_sign_ins_are_recorded_without_secrets(self, cloud: Cloud) -> None:
