@@ -76,6 +76,9 @@ class DeviceHarness:
         self.outbox = Outbox(store, publish=self.publish, device_topic="ts/v1/s/a/arm")
         self.outbox.link_changed(True)
         self.outbox.start()
+        self.readings = ReadingCache(
+            space="s", agent="a", own=["arm"], named=[(rule.device, rule.stream) for rule in interlocks]
+        )
         self.device = Device(
             name="arm",
             label="Arm",
@@ -88,9 +91,7 @@ class DeviceHarness:
             keys=pinned_keys_of(self.key),
             publish=self.publish,
             outbox=self.outbox,
-            readings=ReadingCache(
-                space="s", agent="a", own=["arm"], named=[(rule.device, rule.stream) for rule in interlocks]
-            ),
+            readings=self.readings,
             interlocks=interlocks,
             geometry=geometry,
             sandbox=sandbox or warm_sandbox(),
