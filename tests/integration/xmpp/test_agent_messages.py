@@ -3,6 +3,7 @@
 import time
 
 from device_agent.protocol import AckStatus, JointTarget, Setpoint, Stop, codec, topics
+from device_agent.protocol.security import setpoints
 from function_app.services.storage import records
 from tests.harness.cloud.cloud import Person
 from tests.harness.network.brokers import RunningBroker, wait_until
@@ -39,6 +40,7 @@ def test_setpoints_and_stop_of_a_console_reach_the_robot_over_the_broker(
     request = {"purpose": "control", "device": robot.device, "epoch": lease["epoch"]}
     issued = anna.post("/mqtt/credentials", request).json()
     (topic,) = issued["publish"]
+    key = bytes.fromhex(lease["setpoint_key"])
     with broker.connect(issued["client_id"], (issued["username"], issued["password"])) as console:  # type: ignore[arg-type]
         for sequence in range(1, 21):
             setpoint = Setpoint(
@@ -48,11 +50,12 @@ def test_setpoints_and_stop_of_a_console_reach_the_robot_over_the_broker(
                 sent_ms=0.5,
                 target=JointTarget(position_rad={"a": 0.1}),
             )
-            console.publish(topic, codec.encode(setpoint), qos=0)
+            console.publish(topic, setpoints.seal(codec.encode(setpoint), key, topic), qos=0)
             time.sleep(0.005)
         wait_until(lambda: len(robot.setpoints) >= 20, "every setpoint")
     assert {received for received, _ in robot.setpoints} == {topic}
-    assert [codec.decode(payload, Setpoint).sequence for _, payload in robot.setpoints] == list(range(1, 21))
+    received = [setpoints.open_sealed(payload, (key,), topic) for _, payload in robot.setpoints]
+    assert [codec.decode(body, Setpoint).sequence for body in received] == list(range(1, 21))
     issued = anna.post("/mqtt/credentials", {"purpose": "view"}).json()
     with broker.connect(issued["client_id"], (issued["username"], issued["password"])) as console:  # type: ignore[arg-type]
         console.publish(f"{robot.topic(topics.STOP)}/{anna.account}", codec.encode(Stop(id="s1")))

@@ -10,13 +10,15 @@ from msgspec import inspect
 from device_agent import protocol
 from device_agent.ports import script_calls
 from device_agent.protocol.security.revocation import Control
+from device_agent.protocol.security.setpoints import Tagged
 from function_app.entrypoints import http  # noqa: F401 (defines all request bodies)
 from function_app.entrypoints.http.framework.schemas import Request
 from tests.harness.network import raw_mqtt
 
 KINDS: tuple[Any, ...] = (
     protocol.Presence, protocol.Description, protocol.Twin, protocol.State, protocol.JointTelemetry,
-    protocol.Measurements, protocol.Event, protocol.Ack, protocol.Command, protocol.Setpoint, protocol.Stop, Control,
+    protocol.Measurements, protocol.Event, protocol.Ack, protocol.Command, protocol.Setpoint, protocol.Stop, Tagged,
+    Control,
 )  # fmt: skip
 """Types of the JSON messages of all topics."""
 _DEEPEST = 4
@@ -155,7 +157,7 @@ PACKETS = (
     raw_mqtt.connect_packet("a", None),
     raw_mqtt.publish_packet("ts/v1/s/a/arm/ctl/7", b"{}", qos=1),
     raw_mqtt.publish_packet("ts/v1/s/a/arm/state", b"{}", retain=True),
-    raw_mqtt.subscribe_packet("ts/v1/s/a/+/cmd", "ts/v1/s/a/+/stop", qos=1),
+    raw_mqtt.subscribe_packet("ts/v1/s/a/+/cmd", "ts/v1/s/a/+/stop/+", qos=1),
     raw_mqtt.PINGREQ,
     raw_mqtt.packet(4, b"\0\1"),
     raw_mqtt.packet(10, b"\0\1" + raw_mqtt.text("ts/v1/s/a/+/cmd"), 2),

@@ -43,9 +43,10 @@ def expected() -> dict[str, dict[str, str]]:
 
 
 def channels() -> dict[str, str]:
-    """Channel → address, from the AsyncAPI document."""
+    """Channel → address, from the AsyncAPI document. Stop has two: in the name of the owner and of the operator."""
     document = json.loads((ROOT / "docs" / "asyncapi.json").read_text())
-    return {name: channel["address"] for name, channel in document["channels"].items()}
+    addresses = {name: channel["address"] for name, channel in document["channels"].items()}
+    return addresses | {"stop_of_operator": addresses["stop"].replace("{author}", "{operator}")}
 
 
 @pytest.fixture(params=(*BROKERS, "eventgrid"), scope="module")
@@ -70,8 +71,8 @@ def stage(
 
 
 def _stage(broker: RunningBroker, cloud: Cloud, observer: Client) -> Stage:
-    robot, roles = _people(cloud)
-    topics = {name: address.format(**_names(robot)) for name, address in channels().items()}
+    robot, roles, accounts = _people(cloud)
+    topics = {name: address.format(**_names(robot), **accounts) for name, address in channels().items()}
     wide = (
         "#",
         "ts/#",
@@ -79,8 +80,8 @@ def _stage(broker: RunningBroker, cloud: Cloud, observer: Client) -> Stage:
         f"ts/v1/{robot.space}/#",
         f"ts/v1/+/{robot.id}/#",
         "ts/v1/+/+/conn",
-        *(f"ts/v1/+/+/+/{kind}" for kind in ("state", "desc", "event", "ack", "cmd", "stop")),
-        *(f"ts/v1/+/+/+/{kind}/+" for kind in ("tele", "cam", "ctl", "late", "desc")),
+        *(f"ts/v1/+/+/+/{kind}" for kind in ("state", "desc", "event", "ack", "cmd")),
+        *(f"ts/v1/+/+/+/{kind}/+" for kind in ("tele", "cam", "ctl", "late", "desc", "stop")),
     )
     return Stage(broker, roles, topics, wide, observer)
 
@@ -89,7 +90,7 @@ def _names(robot: Robot) -> dict[str, str]:
     return {"space": robot.space, "agent": robot.id, "device": "arm", "stream": "x", "camera": "x", "epoch": "1"}
 
 
-def _people(cloud: Cloud) -> tuple[Robot, dict[str, dict[str, Any]]]:
+def _people(cloud: Cloud) -> tuple[Robot, dict[str, dict[str, Any]], dict[str, str]]:
     anna, stranger = cloud.sign_in("anna"), cloud.sign_in("stranger")
     robot, foreign = cloud.robot(), cloud.robot()
     robot.pair(anna)
@@ -108,7 +109,7 @@ def _people(cloud: Cloud) -> tuple[Robot, dict[str, dict[str, Any]]]:
     for name, agent in (("agent", robot), ("foreign agent", foreign)):
         roles[name] = agent.request("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
     assert epoch == 1
-    return robot, roles
+    return robot, roles, {"author": anna.account, "operator": people["operator"].account}
 
 
 def _observer(cloud: Cloud, broker: RunningBroker) -> Client:
