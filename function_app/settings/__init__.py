@@ -6,7 +6,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from device_agent.protocol.manifests.shipped import ROBOTS
-from function_app.settings.access import OidcClient, RateLimits, Tls, read_oidc, read_rate_limits, read_tls
+from function_app.settings.access import (
+    ConnectionSettings,
+    OidcClient,
+    RateLimits,
+    Tls,
+    read_connections,
+    read_oidc,
+    read_rate_limits,
+    read_tls,
+)
 from function_app.settings.broker import Broker, EventGridBus, EventGridWebhook, IotBus, Xmpp, read_broker, read_xmpp
 from function_app.settings.environment import Environment, SettingsError
 from function_app.settings.storage import (
@@ -25,6 +34,7 @@ __all__ = [
     "ROOT",
     "AwsStore",
     "AzureStore",
+    "ConnectionSettings",
     "EventGridBus",
     "EventGridWebhook",
     "IotBus",
@@ -87,6 +97,7 @@ class Settings:
     robots: Path = ROBOTS
     console: Path = CONSOLE
     trusted_proxies: int = 0
+    connections: ConnectionSettings = field(default_factory=ConnectionSettings)
     rate_limits: RateLimits = field(default_factory=RateLimits)
     retention: RetentionPeriods = field(default_factory=RetentionPeriods)
 
@@ -126,6 +137,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         robots=env.folder("TELESCOPE_ROBOTS", ROBOTS),
         console=env.folder("TELESCOPE_CONSOLE", CONSOLE),
         trusted_proxies=env.number("TELESCOPE_TRUSTED_PROXIES", 0, 0, 10),
+        connections=read_connections(env),
         rate_limits=read_rate_limits(env),
         retention=read_retention(env),
     )

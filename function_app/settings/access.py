@@ -1,4 +1,4 @@
-"""TLS, sign-in with OpenID Connect, and request limits."""
+"""TLS, sign-in with OpenID Connect, and limits of requests and connections."""
 
 import re
 from dataclasses import dataclass, field
@@ -9,6 +9,7 @@ from function_app.settings.environment import Environment, SettingsError
 
 _CLIENT_ID = re.compile(r"\A[!-~]{1,255}\Z")
 _PROVIDER = re.compile(r"\A[^\x00-\x1f\x7f]{1,60}\Z")
+_HOST_NAMES = re.compile(r"\A[A-Za-z0-9._:\[\], -]{0,2000}\Z")
 _LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 
 
@@ -56,6 +57,34 @@ class RateLimits:
     account: int = 100
     key: int = 20
     agent: int = 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConnectionSettings:
+    """Connections and host names that ``serve`` accepts.
+
+    Attributes:
+        total: Open connections of the process; fewer if the limit of open files is lower.
+        per_address: Open connections of one address; 0: no limit.
+        hosts: Further names in the ``Host`` header.
+    """
+
+    total: int = 4_000
+    per_address: int = 256
+    hosts: tuple[str, ...] = ()
+
+
+def read_connections(env: Environment) -> ConnectionSettings:
+    """The limits of connections, and the accepted host names."""
+    default = ConnectionSettings()
+    names = env.matching(
+        "TELESCOPE_ALLOWED_HOSTS", "", _HOST_NAMES, "host names without ports, separated by commas, such as a.example,b"
+    )
+    return ConnectionSettings(
+        total=env.number("TELESCOPE_CONNECTIONS", default.total, 64, 60_000),
+        per_address=env.number("TELESCOPE_CONNECTIONS_PER_ADDRESS", default.per_address, 0, 60_000),
+        hosts=tuple(name.strip().strip("[]").lower() for name in names.split(",") if name.strip()),
+    )
 
 
 def read_rate_limits(env: Environment) -> RateLimits:

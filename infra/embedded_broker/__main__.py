@@ -14,8 +14,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import function_app
+from function_app.entrypoints.hosts.connection_limits import raise_descriptor_limit
 from infra.embedded_broker.broker import TCP, WEBSOCKET, TelescopeBroker
 from infra.embedded_broker.limits import Limits
+from infra.embedded_broker.log_filter import RepeatFilter
 from infra.embedded_broker.public_keys import KeyRing, KeysError
 from infra.embedded_broker.revocations import Revocations, RevocationsError
 
@@ -28,8 +31,9 @@ def main() -> int:
     """Run the broker; returns the exit code."""
     arguments = _arguments()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    log.addFilter(RepeatFilter())
     revocations_path: Path = arguments.revocations or arguments.keys.with_name(f"{arguments.keys.name}.revoked")
-    limits = Limits()
+    limits = Limits().within(raise_descriptor_limit())
     keys = KeyRing(arguments.keys)
     revocations = Revocations(revocations_path, keep_s=limits.token_s)
     try:
@@ -113,8 +117,9 @@ async def _run(
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     broker = TelescopeBroker(sockets=sockets, keys=keys, revocations=revocations, limits=limits, tls=tls)
-    await broker.start()
     ports = {name: bound.getsockname()[1] for name, bound in sockets.items()}
+    await broker.start()
+    function_app.run_for_long()
     print(f"ready tcp={ports[TCP]} websocket={ports[WEBSOCKET]}", flush=True)
     await stop.wait()
     await broker.shutdown()

@@ -22,8 +22,9 @@ from websockets.asyncio.server import ServerConnection
 
 from device_agent.protocol import codec
 from device_agent.protocol.errors import SignatureError
-from device_agent.protocol.security.grants import issued_at
+from device_agent.protocol.security.grants import Grant, issued_at
 from device_agent.protocol.security.revocation import Control
+from function_app.entrypoints.hosts.connection_limits import ACCEPTS_PER_ITERATION, ConnectionLimits
 from infra.embedded_broker import packets
 from infra.embedded_broker.connection import Admission, Connection, Refused
 from infra.embedded_broker.limits import Limits
@@ -38,6 +39,10 @@ log = logging.getLogger("telescope.broker")
 TCP, WEBSOCKET = "default", "websocket"
 """Listener names; the first is amqtt's default."""
 _TICK_S = 0.25
+_PRIORITY = ("agent:", "service")
+"""Beginnings of the principals of agents and of the functions."""
+_RESERVED_SHARE = 10
+"""One in this number of clients is reserved for them."""
 _FRAME_BYTES = 1024 * 1024
 """Largest WebSocket frame [bytes]; it may contain several packets, each with its own limit."""
 
@@ -71,6 +76,11 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
             )
         )
         self.limits = limits or Limits()
+        self._pending = ConnectionLimits(
+            total=self.limits.pending,
+            per_address=self.limits.pending_per_address,
+            waiting_s=self.limits.connect_timeout_s,
+        )
         self._sockets = sockets
         self._tls = tls
         self._keys = keys
@@ -109,11 +119,12 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
     ) -> Any:
         """Create the server of one listener on its bound socket; overrides amqtt."""
         del address, port, ssl_context
-        listening_socket = self._sockets[listener_name]
+        listening_socket = self._pending.listener(self._sockets[listener_name])
         if listener_type == ListenerType.TCP:
             return await asyncio.get_running_loop().create_server(
-                lambda: TcpTransport(self._connected, congested_bytes=self.limits.congested_bytes),
+                lambda: TcpTransport(self._connected, self._pending, congested_bytes=self.limits.congested_bytes),
                 sock=listening_socket,
+                backlog=ACCEPTS_PER_ITERATION,
                 ssl=self._tls,
                 ssl_handshake_timeout=None if self._tls is None else self.limits.connect_timeout_s,
             )
@@ -122,6 +133,7 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         return await websockets.serve(
             self._websocket_connected,
             sock=listening_socket,
+            backlog=ACCEPTS_PER_ITERATION,
             ssl=self._tls,
             subprotocols=[websockets.Subprotocol("mqtt")],
             compression=None,  # slow for small messages, and permits decompression bombs
@@ -133,15 +145,15 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         )
 
     async def _websocket_connected(self, websocket: ServerConnection) -> None:
-        transport = WebSocketTransport(websocket, self._connected, congested_bytes=self.limits.congested_bytes)
+        transport = WebSocketTransport(
+            websocket, self._connected, self._pending, congested_bytes=self.limits.congested_bytes
+        )
         await transport.serve()
 
     def _connected(self, transport: Transport) -> Connection:
         kind = "TCP" if isinstance(transport, TcpTransport) else "WebSocket"
         connection = Connection(self, transport, time.monotonic(), kind)
         self._connections.add(connection)
-        if len(self._connections) > self.limits.connections:
-            connection.close(f"more than {self.limits.connections} connections")
         return connection
 
     async def _run_timers(self) -> None:
@@ -149,11 +161,18 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
             await asyncio.sleep(_TICK_S)
             try:
                 self._refresh_keys()
+                self._pending.end_late()
+                self._report_ended()
                 now_s, wall_s = time.monotonic(), time.time()
                 for connection in list(self._connections):
                     connection.tick(now_s, wall_s)
             except Exception as error:  # noqa: BLE001 (the loop must continue after any error)
                 log.error("internal error: %s: %s", type(error).__name__, error)  # noqa: TRY400 (no traceback)
+
+    def _report_ended(self) -> None:
+        if self._pending.ended:
+            log.warning("connections without a complete CONNECT were closed: late, or replaced by new ones")
+            self._pending.ended = 0
 
     # ------------------------------------------------------------ authentication
 
@@ -180,7 +199,16 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         admission = Admission(grant, connect.password, issued_at(connect.password))
         if self._revocations.covers(grant, admission.issued_at):
             raise Refused(packets.NOT_AUTHORISED, "the token has been revoked")
+        self._require_room(grant)
         return admission
+
+    def _require_room(self, grant: Grant) -> None:
+        """Reject a client above the limit. A part of it is reserved for agents and for the functions."""
+        limit = self.limits.connections
+        if not grant.principal.startswith(_PRIORITY):
+            limit -= limit // _RESERVED_SHARE
+        if grant.client_id not in self._clients and len(self._clients) >= limit:
+            raise Refused(packets.UNAVAILABLE, f"{len(self._clients)} clients are connected; the maximum is {limit}")
 
     def revoke(self, payload: bytes) -> None:
         """Apply a message of the control topic: store the revocation and close the connections that it covers.

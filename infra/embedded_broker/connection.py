@@ -63,7 +63,7 @@ class Connection:
         self._closed = False
         self._will: packets.Will | None = None
         self._keep_alive_s = 0.0
-        self._opened_s = self._active_s = now_s
+        self._active_s = now_s
         self._active = False
         self._publishable: set[str] = set()
         self._packet_id = 0
@@ -103,9 +103,8 @@ class Connection:
             self._active = False
             self._active_s = now_s
         if self.admission is None:
-            if now_s - self._opened_s > self._limits.connect_timeout_s:
-                self.close("no CONNECT in time")
-        elif wall_s >= self.admission.grant.expires_at:
+            return  # the listener limits the time to CONNECT
+        if wall_s >= self.admission.grant.expires_at:
             self.close("the token has expired")
         elif self._keep_alive_s and now_s - self._active_s > self._keep_alive_s:
             self.close("keep-alive timeout")
@@ -191,12 +190,15 @@ class Connection:
         self._will = connect.will
         self._keep_alive_s = connect.keep_alive_s * KEEP_ALIVE_FACTOR
         self._framer.accept_all()
+        self._transport.admitted()
         self._broker.register(self)
         self._transport.write(packets.connack(packets.ACCEPTED))
 
     def _check_will(self, will: packets.Will | None, grant: Grant) -> None:
         if will is None:
             return
+        if will.qos > packets.MAX_QOS:
+            raise Refused(packets.NOT_AUTHORISED, f"the will has QoS {will.qos}; the maximum is {packets.MAX_QOS}")
         if not valid_topic(will.topic, self._limits.topic_bytes) or not grant.may_publish(will.topic):
             raise Refused(packets.NOT_AUTHORISED, "the grant does not permit the topic of the will")
         if will.retain and not topics.may_retain(will.topic):

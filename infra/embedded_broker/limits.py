@@ -1,6 +1,6 @@
 """Limits per client and in total. The defaults are for one machine."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from device_agent.protocol import codec
 
@@ -10,8 +10,10 @@ class Limits:
     """Limits of the embedded broker.
 
     Attributes:
-        connections: Open sockets on both listeners; further ones are closed immediately.
-        connect_timeout_s: Time for a complete CONNECT [s].
+        connections: Authenticated clients on both listeners; one in ten is reserved for agents and the functions.
+        pending: Connections that are not authenticated yet; a new one replaces the oldest.
+        pending_per_address: The same for one address.
+        connect_timeout_s: Time from accepting a connection to its CONNECT, with TLS and WebSocket handshake [s].
         connect_bytes: Largest CONNECT: token, user name and will [bytes].
         payload_bytes: Largest payload [bytes], as in AWS IoT Core.
         retained_bytes: Largest retained payload [bytes], as in Event Grid.
@@ -29,7 +31,9 @@ class Limits:
     """
 
     connections: int = 1_000
-    connect_timeout_s: float = 10.0
+    pending: int = 256
+    pending_per_address: int = 64
+    connect_timeout_s: float = 3.0
     connect_bytes: int = 16 * 1024
     payload_bytes: int = codec.MAX_BYTES
     retained_bytes: int = codec.MAX_RETAINED_BYTES
@@ -44,3 +48,8 @@ class Limits:
     congested_bytes: int = 256 * 1024
     unsent_bytes: int = 4 * 1024 * 1024
     token_s: float = 30 * 86_400.0
+
+    def within(self, descriptors: int) -> "Limits":
+        """Limits that need at most this number of connections."""
+        pending = max(1, min(self.pending, descriptors // 2))
+        return replace(self, pending=pending, connections=max(1, min(self.connections, descriptors - pending)))

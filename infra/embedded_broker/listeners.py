@@ -13,6 +13,8 @@ from typing import Protocol, cast
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
+from function_app.entrypoints.hosts.connection_limits import ConnectionLimits
+
 CLOSE_S = 1.0
 """Time for a client to read pending data before its connection closes [s]."""
 
@@ -27,6 +29,9 @@ class Transport(Protocol):
     @property
     def congested(self) -> bool:
         """Whether the unsent data exceeds the limit for QoS 0 messages."""
+
+    def admitted(self) -> None:
+        """The client is authenticated: limits for other connections no longer apply."""
 
     def write(self, data: bytes) -> None:
         """Send data; never blocks; ignored after closing."""
@@ -59,11 +64,19 @@ def disable_nagle(transport: asyncio.BaseTransport) -> None:
     transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
+def _admit(limits: ConnectionLimits, transport: asyncio.BaseTransport) -> None:
+    connection = limits.attach(transport)
+    if connection is not None:
+        limits.trust(connection.address)
+        limits.release(connection)
+
+
 class TcpTransport(asyncio.Protocol):
     """One accepted TCP socket."""
 
-    def __init__(self, connected: Connected, *, congested_bytes: int) -> None:
+    def __init__(self, connected: Connected, limits: ConnectionLimits, *, congested_bytes: int) -> None:
         self._connected = connected
+        self._limits = limits
         self._congested_bytes = congested_bytes
         self._receiver: Receiver | None = None
         self._transport: asyncio.Transport | None = None
@@ -73,6 +86,7 @@ class TcpTransport(asyncio.Protocol):
         """See ``asyncio.Protocol``."""
         self._transport = cast("asyncio.Transport", transport)
         disable_nagle(transport)
+        self._limits.attach(transport)
         self._transport.set_write_buffer_limits(high=self._congested_bytes)
         self._receiver = self._connected(self)
 
@@ -102,6 +116,11 @@ class TcpTransport(asyncio.Protocol):
         """See ``Transport``."""
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
+    def admitted(self) -> None:
+        """See ``Transport``."""
+        if self._transport is not None:
+            _admit(self._limits, self._transport)
+
     def write(self, data: bytes) -> None:
         """See ``Transport``."""
         if self._transport is not None and not self._transport.is_closing():
@@ -122,14 +141,18 @@ class TcpTransport(asyncio.Protocol):
 class WebSocketTransport:
     """One accepted WebSocket. Packets written while a frame is being sent share the next frame."""
 
-    def __init__(self, websocket: ServerConnection, connected: Connected, *, congested_bytes: int) -> None:
+    def __init__(
+        self, websocket: ServerConnection, connected: Connected, limits: ConnectionLimits, *, congested_bytes: int
+    ) -> None:
         self._websocket = websocket
+        self._limits = limits
         self._congested_bytes = congested_bytes
         self._pending: list[bytes] = []
         self._unsent = 0
         self._closing = False
         self._wake = asyncio.Event()
         disable_nagle(websocket.transport)
+        limits.attach(websocket.transport)
         self._receiver = connected(self)
 
     async def serve(self) -> None:
@@ -158,6 +181,10 @@ class WebSocketTransport:
     def congested(self) -> bool:
         """See ``Transport``."""
         return self._unsent > self._congested_bytes
+
+    def admitted(self) -> None:
+        """See ``Transport``."""
+        _admit(self._limits, self._websocket.transport)
 
     def write(self, data: bytes) -> None:
         """See ``Transport``."""

@@ -21,12 +21,14 @@ from infra.embedded_broker.limits import Limits
 
 T = TypeVar("T")
 
-ACCEPTED, BAD_PROTOCOL, BAD_CLIENT_ID, NOT_AUTHORISED = 0, 1, 2, 5
+ACCEPTED, BAD_PROTOCOL, BAD_CLIENT_ID, UNAVAILABLE, NOT_AUTHORISED = 0, 1, 2, 3, 5
 """CONNACK return codes."""
 REFUSED = 0x80
 """SUBACK return code of a rejected filter."""
 PINGRESP = b"\xd0\x00"
 MAX_QOS = 1
+_HIGHEST_QOS = 2
+"""Highest QoS of the specification; higher ones are malformed."""
 _QOS_MASK = 0x06
 _MAX_LENGTH_SHIFT = 21
 _SHORT = 0x80
@@ -155,7 +157,7 @@ def read_connect(body: bytes) -> Connect:
             raise UnacceptableProtocol(f"MQTT level {header.proto_level}")
         raise MalformedPacket("CONNECT of another protocol")
     will_flags = header.will_qos or header.will_retain_flag
-    if header.reserved_flag or (will_flags and not header.will_flag) or header.will_qos > MAX_QOS:
+    if header.reserved_flag or (will_flags and not header.will_flag) or header.will_qos > _HIGHEST_QOS:
         raise MalformedPacket(f"flags {header.flags:#04x} in CONNECT")
     payload = _result_of(ConnectPayload.from_stream(reader, None, header))
     missing = (
@@ -209,7 +211,7 @@ def read_subscribe(frame: Frame) -> tuple[int, list[tuple[str, int]]]:
     """
     packet = _packet(SubscribePacket, frame)
     filters: list[tuple[str, int]] = list(packet.payload.topics)
-    if _misread(frame, [text for text, _ in filters], 3) or any(qos > MAX_QOS + 1 for _, qos in filters):
+    if _misread(frame, [text for text, _ in filters], 3) or any(qos > _HIGHEST_QOS for _, qos in filters):
         raise MalformedPacket("inconsistent fields in SUBSCRIBE")
     return packet.variable_header.packet_id, filters
 

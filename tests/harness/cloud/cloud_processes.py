@@ -11,7 +11,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, Self
 
@@ -55,8 +55,11 @@ class Endpoint(Protocol):
 class Server:
     """``python -m function_app serve``."""
 
-    def __init__(self, environment: Mapping[str, str], stack: contextlib.ExitStack) -> None:
+    def __init__(
+        self, environment: Mapping[str, str], stack: contextlib.ExitStack, launcher: Sequence[str] = ()
+    ) -> None:
         self.port = _free_port()
+        self._command = ["-m", *launcher, "function_app", "serve"]
         self._environment = environment_of({**environment, "TELESCOPE_PORT": str(self.port)})
         self._stack = stack
         self._program: Program | None = None
@@ -68,7 +71,7 @@ class Server:
         self._program.process.wait()
 
     def revive(self) -> None:
-        program = self._stack.enter_context(start_program(["-m", "function_app", "serve"], self._environment))
+        program = self._stack.enter_context(start_program(self._command, self._environment))
         self._program = program
         wait_until(lambda: _listens(self.port) or program.process.poll() is not None, "the server")
         assert program.process.poll() is None, program.stderr()
@@ -77,9 +80,11 @@ class Server:
 class BrokerEndpoint:
     """The broker's process."""
 
-    def __init__(self, kind: BrokerKind, folder: Path, keys: Path, stack: contextlib.ExitStack) -> None:
+    def __init__(
+        self, kind: BrokerKind, folder: Path, keys: Path, stack: contextlib.ExitStack, launcher: Sequence[str] = ()
+    ) -> None:
         self._begin = lambda **ports: stack.enter_context(
-            start_broker(kind, folder, keys=keys / "public.json", **ports)
+            start_broker(kind, folder, keys=keys / "public.json", launcher=launcher, **ports)
         )
         self.running: RunningBroker = self._begin()
         self.port = self.running.tcp_port
@@ -101,13 +106,18 @@ class CloudProcesses:
     """
 
     def __init__(
-        self, kind: BrokerKind, folder: Path, stack: contextlib.ExitStack, more: Mapping[str, str] | None = None
+        self,
+        kind: BrokerKind,
+        folder: Path,
+        stack: contextlib.ExitStack,
+        more: Mapping[str, str] | None = None,
+        launcher: Sequence[str] = (),
     ) -> None:
         home = folder / "home"
         FileKeys(home / "keys").load()
         self.stack = stack
         self.folder = folder
-        self.broker = BrokerEndpoint(kind, folder / "broker", home / "keys", stack)
+        self.broker = BrokerEndpoint(kind, folder / "broker", home / "keys", stack, launcher)
         if kind == "mosquitto":
             (home / "mosquitto").symlink_to(folder / "broker")
         self.environment: dict[str, str] = {
@@ -116,7 +126,7 @@ class CloudProcesses:
             "TELESCOPE_MQTT_PORT": str(self.broker.port),
             **(more or {}),
         }
-        self.endpoints: dict[str, Endpoint] = {"broker": self.broker, "server": Server(self.environment, stack)}
+        self.endpoints: dict[str, Endpoint] = {"broker": self.broker, "server": Server(self.environment, stack, launcher)}
         self.url = f"http://{HOST}:{self.endpoints['server'].port}"
         self.home = home
         self._last_ms = 0
@@ -182,11 +192,14 @@ class CloudProcesses:
 
 @contextlib.contextmanager
 def start_cloud_processes(
-    kind: BrokerKind, folder: Path, more: Mapping[str, str] | None = None
+    kind: BrokerKind, folder: Path, more: Mapping[str, str] | None = None, *, launcher: Sequence[str] = ()
 ) -> Iterator[CloudProcesses]:
-    """Start server, broker and functions with these additional settings; the context stops them."""
+    """Start server, broker and functions with these additional settings; the context stops them.
+
+    ``launcher``: module and arguments of a program that runs server and broker.
+    """
     with contextlib.ExitStack() as stack:
-        yield CloudProcesses(kind, folder, stack, more)
+        yield CloudProcesses(kind, folder, stack, more, launcher)
 
 
 class Link:

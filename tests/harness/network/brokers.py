@@ -300,6 +300,7 @@ def start_broker(
     keys: Path | None = None,
     more: Sequence[str] = (),
     tls: ssl.SSLContext | None = None,
+    launcher: Sequence[str] = (),
 ) -> Iterator[RunningBroker]:
     """Run a broker within a ``with`` block.
 
@@ -310,6 +311,7 @@ def start_broker(
         keys: For amqtt: public keys of the functions under test; ``access`` cannot issue grants then.
         more: Additional arguments of the program.
         tls: TLS context of the functions' own clients, if ``more`` enables TLS.
+        launcher: Module and arguments of a program that runs the broker.
     """
     home.mkdir(parents=True, exist_ok=True)
     ports = [*more, "--host", HOST, "--tcp-port", str(tcp_port), "--websocket-port", str(websocket_port)]
@@ -321,7 +323,11 @@ def start_broker(
         arguments = ["infra.mosquitto", *ports, "--home", str(home)]
     with (home / "broker.stderr").open("a") as stderr, _running_loop() as loop:
         process = subprocess.Popen(
-            [sys.executable, "-m", *arguments], cwd=ROOT, stdout=subprocess.PIPE, stderr=stderr, text=True
+            [sys.executable, "-m", *launcher, *arguments],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
         )
         with process:
             broker = None

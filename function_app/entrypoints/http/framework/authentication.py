@@ -16,6 +16,8 @@ from function_app.services.identity.rate_limiter import RateLimiter
 
 COOKIE = "telescope_session"
 CSRF_HEADER = "X-CSRF-Token"
+AUTHENTICATED = "telescope.authenticated"
+"""Key of an ASGI scope whose request was authenticated."""
 _STOP = re.compile(r"/api/v1/((devices|spaces)/[^/]+/)?stop")
 _SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 
@@ -44,6 +46,7 @@ class RequestAuthenticator:
             caller = await self._authenticator.person(token, API)
         else:
             caller, _ = await self.page(request)
+        request.scope[AUTHENTICATED] = True
         if not is_stop(request):
             self._limits.admit("key" if caller.key else "account", caller.key or caller.account)
         return caller
@@ -75,6 +78,7 @@ class RequestAuthenticator:
             Problem: ``unauthorized``.
         """
         agent = await self._authenticator.agent(bearer(request))
+        request.scope[AUTHENTICATED] = True
         self._limits.admit("agent", agent.id)
         return agent
 
