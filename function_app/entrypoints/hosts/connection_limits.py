@@ -120,7 +120,7 @@ class ConnectionLimits:
         self.ended = 0
         self._per_address = per_address
         self._waiting_s = waiting_s
-        self._now_s = now_s
+        self.now_s = now_s
         self._sockets: dict[int, AcceptedSocket] = {}
         self._limited: dict[str, OrderedDict[AcceptedSocket, None]] = {}
         self._count = 0
@@ -172,7 +172,7 @@ class ConnectionLimits:
 
     def end_late(self) -> None:
         """End connections whose deadline has passed."""
-        now_s = self._now_s()
+        now_s = self.now_s()
         for connection in list(self._sockets.values()):
             if now_s >= connection.deadline_s:
                 self._end(connection)
@@ -197,7 +197,7 @@ class ConnectionLimits:
         connection.limits = self
         connection.address = _network(address)
         connection.state = State.WAITING
-        connection.deadline_s = self._now_s() + self._waiting_s
+        connection.deadline_s = self.now_s() + self._waiting_s
         connection.trusted = connection.address in self._trusted
         self._sockets[connection.fileno()] = connection
         if not self._make_room(connection.address):
@@ -229,7 +229,7 @@ class ConnectionLimits:
     def _end(self, connection: AcceptedSocket) -> None:
         self._forget(connection)
         self.ended += 1
-        connection.deadline_s = self._now_s() + 1  # again, if the transport did not notice
+        connection.deadline_s = self.now_s() + 1  # again, if the transport did not notice
         connection.end()
 
     def _forget(self, connection: AcceptedSocket) -> None:

@@ -4,7 +4,6 @@ uvicorn has a keep-alive timeout only: a client that sends half a request keeps 
 """
 
 import asyncio
-import time
 from asyncio import BaseTransport
 from typing import Any
 
@@ -41,6 +40,7 @@ class HttpConnection(H11Protocol):
         self._limits = limits
         self._socket: AcceptedSocket | None = None
         self._deadline_s = _NEVER_S
+        self._read_by_s = _NEVER_S
         self._phase: object = None
 
     def connection_made(self, transport: BaseTransport) -> None:  # type: ignore[override]
@@ -48,7 +48,7 @@ class HttpConnection(H11Protocol):
         super().connection_made(transport)  # type: ignore[arg-type]
         self._socket = self._limits.attach(transport)
         self._phase = h11.IDLE
-        self._deadline_s = time.monotonic() + HEADERS_S
+        self._deadline_s = self._limits.now_s() + HEADERS_S
 
     def data_received(self, data: bytes) -> None:
         """See ``asyncio.Protocol``."""
@@ -63,41 +63,44 @@ class HttpConnection(H11Protocol):
     def pause_writing(self) -> None:
         """See ``asyncio.Protocol``."""
         super().pause_writing()
-        if self._socket is not None:
-            self._limits.mark(self._socket, self._socket.state, time.monotonic() + _UNREAD_S)
+        self._read_by_s = self._limits.now_s() + _UNREAD_S
+        self._mark(None)
 
     def resume_writing(self) -> None:
         """See ``asyncio.Protocol``."""
         super().resume_writing()
-        if self._socket is not None:
-            self._limits.mark(self._socket, self._socket.state, self._deadline_s)
+        self._read_by_s = _NEVER_S
+        self._mark(None)
 
     def _unsupported_upgrade_warning(self) -> None:
         """Answer as to any other request, without a line in the log."""
 
     def _update(self, received: int) -> None:
         """Determine what the connection waits for, and until when."""
-        if self._socket is None:
-            return
         phase: object = self.conn.their_state
         state = State.WAITING
         started = phase is not self._phase
         if self.transport.is_closing():
             state, phase = State.IDLE, h11.CLOSED
             if self._phase is not phase:
-                self._deadline_s = time.monotonic() + _CLOSE_S
+                self._deadline_s = self._limits.now_s() + _CLOSE_S
         elif phase is h11.SEND_BODY:
             if started:
-                self._deadline_s = time.monotonic() + _BODY_S
+                self._deadline_s = self._limits.now_s() + _BODY_S
             self._deadline_s += received / _BODY_BYTES_PER_S
         elif phase is not h11.IDLE or (self.cycle is not None and not self.cycle.response_complete):
             state, self._deadline_s = State.ACTIVE, _NEVER_S
         elif self.cycle is not None and not self.conn.trailing_data[0]:
             state, phase, self._deadline_s = State.IDLE, None, _NEVER_S
         elif started:
-            self._deadline_s = time.monotonic() + HEADERS_S
+            self._deadline_s = self._limits.now_s() + HEADERS_S
         self._phase = phase
-        self._limits.mark(self._socket, state, self._deadline_s)
+        self._mark(state)
+
+    def _mark(self, state: State | None) -> None:
+        if self._socket is not None:
+            state = self._socket.state if state is None else state
+            self._limits.mark(self._socket, state, min(self._deadline_s, self._read_by_s))
 
 
 class RequestLimits:

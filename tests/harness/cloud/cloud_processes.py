@@ -126,7 +126,10 @@ class CloudProcesses:
             "TELESCOPE_MQTT_PORT": str(self.broker.port),
             **(more or {}),
         }
-        self.endpoints: dict[str, Endpoint] = {"broker": self.broker, "server": Server(self.environment, stack, launcher)}
+        self.endpoints: dict[str, Endpoint] = {
+            "broker": self.broker,
+            "server": Server(self.environment, stack, launcher),
+        }
         self.url = f"http://{HOST}:{self.endpoints['server'].port}"
         self.home = home
         self._last_ms = 0

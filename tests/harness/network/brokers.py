@@ -323,11 +323,7 @@ def start_broker(
         arguments = ["infra.mosquitto", *ports, "--home", str(home)]
     with (home / "broker.stderr").open("a") as stderr, _running_loop() as loop:
         process = subprocess.Popen(
-            [sys.executable, "-m", *launcher, *arguments],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            text=True,
+            [sys.executable, "-m", *launcher, *arguments], cwd=ROOT, stdout=subprocess.PIPE, stderr=stderr, text=True
         )
         with process:
             broker = None

@@ -131,6 +131,15 @@ def test_an_invalid_request_does_not_disturb_the_server(server: int, request_: b
     assert httpx.get(f"http://{LOOPBACK}:{server}{API}/health").status_code == 200
 
 
+@pytest.mark.parametrize("path", [f"{API}/health", "/"])
+def test_a_request_under_the_name_of_another_site_is_rejected(server: int, path: str) -> None:
+    """Otherwise a page of another site reaches the API after it has changed its address to that of this server."""
+    url = f"http://{LOOPBACK}:{server}{path}"
+    rejected = problem(httpx.get(url, headers={"Host": f"attacker.example:{server}"}), 400, "host")
+    assert "TELESCOPE_ALLOWED_HOSTS" in rejected["detail"]
+    assert httpx.get(url, headers={"Host": "localhost"}).status_code != 400
+
+
 def test_responses_are_sent_without_delay_on_every_accepted_connection() -> None:
     """Nagle's algorithm and the client's delayed acknowledgement together cost 40 ms per response."""
 

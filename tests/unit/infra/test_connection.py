@@ -26,6 +26,10 @@ class RecordingTransport:
         self.congested = False
         self.unsent = 0
         self.closed = False
+        self.refusal = b""
+
+    def admitted(self) -> None:
+        """Limits of a listener do not apply here."""
 
     def write(self, data: bytes) -> None:
         self.written.append(data)
@@ -51,14 +55,25 @@ class Harness:
     async def _create(self, limits: Limits) -> TelescopeBroker:
         return TelescopeBroker(sockets={}, keys=self.keys, revocations=self.revocations, limits=limits)
 
-    def client(self, client_id: str, *subscriptions: str, qos: int = 1) -> tuple[RecordingTransport, Connection]:
+    def issue(self, client_id: str, principal: str = "p") -> Credentials:
         rights, expires_at = ("ts/#",), int(time.time()) + 60
         grant = Grant(
-            principal="p", client_id=client_id, publish=rights, subscribe=rights, token_id="t", expires_at=expires_at
+            principal=principal,
+            client_id=client_id,
+            publish=rights,
+            subscribe=rights,
+            token_id="t",
+            expires_at=expires_at,
         )
+        return Credentials(principal, grants.issue(grant, self._key))
+
+    def client(
+        self, client_id: str, *subscriptions: str, qos: int = 1, principal: str = "p"
+    ) -> tuple[RecordingTransport, Connection]:
         transport = RecordingTransport()
         connection = self.broker._connected(transport)
-        connection.received(raw_mqtt.connect_packet(client_id, Credentials("p", grants.issue(grant, self._key))))
+        connection.received(raw_mqtt.connect_packet(client_id, self.issue(client_id, principal)))
+        transport.refusal = b"".join(transport.written) if transport.closed else b""
         if subscriptions:
             connection.received(raw_mqtt.subscribe_packet(*subscriptions, qos=qos))
         transport.written.clear()
@@ -68,10 +83,29 @@ class Harness:
         self.broker.publish(TOPIC, payload, qos=qos, retain=retain, owner="x")
 
 
-def test_connections_above_the_limit_are_closed(tmp_path: Path) -> None:
-    harness = Harness(tmp_path, connections=2)
-    transports = [harness.client(name)[0] for name in ("first", "second", "third", "second")]
-    assert [transport.closed for transport in transports] == [False, False, True, True]
+def test_agents_can_connect_when_the_other_clients_have_reached_their_limit(tmp_path: Path) -> None:
+    harness = Harness(tmp_path, connections=10)
+    pages = [harness.client(f"page{number}", principal="account:p")[0] for number in range(10)]
+    assert [transport.closed for transport in pages] == [False] * 9 + [True]
+    assert pages[9].refusal == raw_mqtt.packet(raw_mqtt.CONNACK, b"\0\3")
+    assert not harness.client("agent", principal="agent:a")[0].closed
+    assert harness.client("other", principal="agent:b")[0].closed
+    assert not harness.client("agent", principal="agent:a")[0].closed, "an agent replaces its own connection"
+
+
+def test_a_will_at_qos_2_is_refused_with_a_connack_and_logged_with_the_client(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    harness = Harness(tmp_path)
+    transport = RecordingTransport()
+    packet = bytearray(raw_mqtt.connect_with_will("client", harness.issue("client"), TOPIC, b"x", keep_alive_s=60))
+    flags = packet.index(b"MQTT") + 5
+    packet[flags] |= 0x10
+    packet[flags] &= ~0x08
+    harness.broker._connected(transport).received(bytes(packet))
+    assert transport.written == [raw_mqtt.packet(raw_mqtt.CONNACK, b"\0\5")]
+    assert transport.closed
+    assert "CONNECT as 'client' refused: the will has QoS 2; the maximum is 1" in caplog.text
 
 
 def test_qos_1_messages_are_queued_in_order_until_acknowledged(tmp_path: Path) -> None:
@@ -139,17 +173,6 @@ def test_too_many_retained_topics_close_the_connection(tmp_path: Path) -> None:
     for number in range(3):
         assert not transport.closed
         client.received(raw_mqtt.publish_packet(f"ts/{number}", b"x", retain=True))
-    assert transport.closed
-
-
-def test_a_client_without_connect_times_out(tmp_path: Path) -> None:
-    transport = RecordingTransport()
-    client = Harness(tmp_path).broker._connected(transport)
-    now_s = time.monotonic()
-    client.received(b"\x10")
-    client.tick(now_s + 9, time.time())
-    assert not transport.closed
-    client.tick(now_s + 11, time.time())
     assert transport.closed
 
 
