@@ -115,8 +115,18 @@ def main() -> None:
 
 
 def _explain(error: BaseException, filename: str) -> str:
-    text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    text = _without_class_names(str(error))
+    if not isinstance(error, api.RobotError):
+        text = f"{type(error).__name__}: {text}" if text else type(error).__name__
     if isinstance(error, SyntaxError) and error.filename == filename:
         return f"line {error.lineno}: {text}"
     lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == filename]
     return f"line {lines[-1]}: {text}" if lines else text
+
+
+def _without_class_names(message: str) -> str:
+    """Python's messages name the class of an object; a script only knows ``robot`` and ``room``."""
+    for kind in (api.Robot, api.Room):
+        name = kind.__name__
+        message = message.replace(f"'{name}' object", name.lower()).replace(f"{name}.", f"{name.lower()}.")
+    return message

@@ -192,9 +192,9 @@ class _Run:
             self.end(AckStatus.FAILED, refused)
         except ScriptFailed as failed:
             self.end(AckStatus.FAILED, Refused("script_failed", str(failed)))
-        except Exception as error:  # noqa: BLE001 (any error ends the action as failed)
+        except Exception:  # noqa: BLE001 (any error ends the action as failed)
             _log.exception("action %s", self.command.id)
-            self.end(AckStatus.FAILED, Refused("internal", f"internal error: {error}; see the agent's log"))
+            self.end(AckStatus.FAILED, Refused("internal", "the agent failed during the action; see the agent's log"))
 
     def end(self, status: AckStatus, why: Refused) -> None:
         """End the action, from any thread; the first reason applies."""
