@@ -217,7 +217,7 @@ class ConnectionLimits:
     # ------------------------------------------------------------ internals
 
     def _make_room(self, address: str) -> bool:
-        own = self._limited.get(address, {})
+        own = self._limited.get(address, OrderedDict())
         if self._per_address and len(own) >= self._per_address:
             replaceable = [connection for connection in own if connection.state is not State.ACTIVE]
             if not replaceable:

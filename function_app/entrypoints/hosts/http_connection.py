@@ -43,7 +43,7 @@ class HttpConnection(H11Protocol):
         self._read_by_s = _NEVER_S
         self._phase: object = None
 
-    def connection_made(self, transport: BaseTransport) -> None:  # type: ignore[override]
+    def connection_made(self, transport: BaseTransport) -> None:
         """See ``asyncio.Protocol``."""
         super().connection_made(transport)  # type: ignore[arg-type]
         self._socket = self._limits.attach(transport)

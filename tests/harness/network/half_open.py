@@ -1,8 +1,8 @@
 """``python -m tests.harness.network.half_open PORT:KIND:COUNT…``: clients that connect and never finish a request.
 
 Opens COUNT connections to each port, half of them from 127.0.0.1 and the others from sixteen further addresses. Each
-sends nothing or part of a request, and connects again one to nine seconds after the server has closed it. Prints ``open`` when
-all have connected once, and then ``closed`` for a line on standard input, after closing all of them.
+sends nothing or part of a request, and connects again one to nine seconds after the server has closed it. Prints
+``open`` when all have connected once, and then ``closed`` for a line on standard input, after closing all of them.
 """
 
 import asyncio
@@ -28,9 +28,11 @@ PARTS = {
     "websockets": (
         b"",
         b"GET /mqtt HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: ",
-        b"GET /mqtt HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
-        b"Sec-WebSocket-Protocol: mqtt\r\n\r\n",
+        (
+            b"GET /mqtt HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"  # pragma: allowlist secret
+            b"Sec-WebSocket-Protocol: mqtt\r\n\r\n"
+        ),
     ),
 }
 
@@ -108,12 +110,12 @@ async def _main() -> None:
             again_s = AGAIN_S[0] + (AGAIN_S[1] - AGAIN_S[0]) * (number / int(count))
             tasks.append(asyncio.create_task(_remain(int(port), source, next(parts), event, again_s)))
     await asyncio.gather(*(event.wait() for event in events))
-    print("open", flush=True)
+    print("open", flush=True)  # noqa: T201 (command-line program)
     await asyncio.to_thread(sys.stdin.readline)
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
-    print("closed", flush=True)
+    print("closed", flush=True)  # noqa: T201 (command-line program)
     await asyncio.to_thread(sys.stdin.readline)
 
 
