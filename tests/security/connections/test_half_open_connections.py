@@ -60,7 +60,7 @@ class Operator:
     def stop_over_mqtt(self) -> float:
         """Time of one Stop over the existing connection [s]."""
         number = f"mqtt-{next(self._numbers)}"
-        payload = codec.encode(Stop(id=number, caller="anna", reason=number))
+        payload = codec.encode(Stop(id=number, reason=number))
         return self._measured(number, lambda: self.mqtt.publish(self._stop_topic, payload))
 
     def stop_over_http(self) -> float:
