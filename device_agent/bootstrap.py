@@ -181,6 +181,29 @@ def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundin
         raise ConfigError(str(error)) from error
 
 
+def renderer_name(configuration: AgentConfig) -> str:
+    """Name of the library that renders simulated cameras, or why there is none; empty without simulated devices."""
+    if not simulates(configuration):
+        return ""
+    from device_agent.simulation import offscreen  # noqa: PLC0415 (real devices need no simulation)
+
+    try:
+        return offscreen.select().name
+    except SensorError as error:
+        return f"none: {error}"
+
+
+def simulates(configuration: AgentConfig) -> bool:
+    """Whether MuJoCo simulates a device of this agent."""
+    return any(_driver_of(entry) == "mujoco" for entry in configuration.devices)
+
+
+def _driver_of(entry: DeviceEntry) -> str:
+    with contextlib.suppress(ConfigError):
+        return entry.driver or type_of(entry).driver
+    return ""
+
+
 def cloud_client(
     store: IdentityStore, configuration: AgentConfig, clock: CloudClock, *, create: bool = False
 ) -> CloudClient:

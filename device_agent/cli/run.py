@@ -77,6 +77,8 @@ def _run_until_unpaired(store: IdentityStore, trace: Path | None) -> bool:
     previous = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     agent = bootstrap.build(store, trace=trace)
     try:
+        if renderer := bootstrap.renderer_name(AgentConfig.load(store.folder)):
+            print(f"renderer {renderer}", flush=True)
         agent.start()
         _prioritize_control_loops()
         print("running", flush=True)

@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from device_agent.ports.sensor import Bytes, Depths, Floats, SensorError
 from device_agent.ports.simulation import SimulatedWorld
+from device_agent.simulation import offscreen
 
 TIMEOUT_S = 5.0
 """A frame that is not rendered within this time is abandoned."""
@@ -198,7 +199,7 @@ def _in_view(model: Any, data: Any, camera: int, width: int, height: int) -> npt
 
 
 class _FrameBuffer:
-    """An offscreen context of one size. MuJoCo's own must be selected before MuJoCo is first imported."""
+    """An offscreen context of one size."""
 
     def __init__(self, model: Any, width: int, height: int) -> None:
         whole = model.vis.global_
@@ -210,7 +211,7 @@ class _FrameBuffer:
         self._bare.flags[int(mujoco.mjtVisFlag.mjVIS_TEXTURE)] = 0
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._screen = _screen()(width, height)
+        self._screen = offscreen.select().create(width, height)
         self._screen.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
@@ -250,21 +251,6 @@ class _FrameBuffer:
             self._screen.make_current()
             self._context.free()
             self._screen.free()
-
-
-def _screen() -> Any:
-    """The GL context class: software rendering, or the backend that ``MUJOCO_GL`` names."""
-    try:
-        if sys.platform != "linux" or os.environ.get("MUJOCO_GL", "osmesa").lower() not in {"osmesa", "egl"}:
-            from mujoco.rendering.classic.gl_context import GLContext  # noqa: PLC0415 (opens a library)
-        elif os.environ.get("MUJOCO_GL", "").lower() == "egl":
-            from mujoco.egl import GLContext  # noqa: PLC0415
-        else:
-            os.environ["MUJOCO_GL"] = "osmesa"  # PyOpenGL reads it, too
-            from mujoco.osmesa import GLContext  # noqa: PLC0415
-    except (ImportError, AttributeError, OSError, RuntimeError) as error:
-        raise SensorError(f"no offscreen renderer is available ({error}); install libosmesa6 and pyopengl") from error
-    return GLContext
 
 
 _renderers: "weakref.WeakKeyDictionary[SimulatedWorld, Renderer]" = weakref.WeakKeyDictionary()

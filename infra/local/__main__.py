@@ -66,7 +66,8 @@ class LocalStack:
             agent += ["--trace", trace]
         self._run("agent", *agent).wait_for_line("running", _START_TIMEOUT_S)
         self._await_device()
-        print(f"ready {self._settings.url}/  sign in once with {self._sign_in_link()}", flush=True)
+        link = self._sign_in_link()
+        print(f"ready {self._settings.url}/  sign in once with {link}  {self._renderer()}".rstrip(), flush=True)
 
     def watch(self, stopping: threading.Event) -> None:
         """Restart programs that exit, until ``stopping`` is set.
@@ -215,6 +216,10 @@ class LocalStack:
                 raise StartError(agent.last_line())
             time.sleep(0.05)
         raise StartError(f"the agent did not connect within {_START_TIMEOUT_S:.0f} s; see {agent.log}")
+
+    def _renderer(self) -> str:
+        """The agent's line about its renderer; empty without simulated devices."""
+        return next((line for line in self._children[-1].output_lines() if line.startswith("renderer ")), "")
 
     @property
     def _has_private_ca(self) -> bool:

@@ -4,7 +4,8 @@ import importlib.util
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from pathlib import Path
 
 from device_agent import bootstrap
 from device_agent.cli.doctor.finding import Finding, ok, problem, warning
@@ -16,17 +17,17 @@ from device_agent.ports.geometry import GeometryError
 from device_agent.ports.sensor import SensorError
 from device_agent.runtime.room.room_device import RoomDevice
 
+_ROOT = Path(__file__).resolve().parents[3]
 _RENDER_S = 60.0
 _RENDER = """
 import mujoco
-model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><light pos="0 0 3"/><geom size=".1"/></worldbody></mujoco>')
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-with mujoco.Renderer(model, 48, 64) as renderer:
-    renderer.update_scene(data)
-    assert renderer.render().any()
+from device_agent.simulation import offscreen
+model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>')
+backend = offscreen.select()
+backend.create(64, 48).make_current()
+mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+print(backend.name)
 """
-_SOFTWARE = {"MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "osmesa"}
 
 
 def device(entry: DeviceEntry) -> Iterator[Finding]:
@@ -81,42 +82,33 @@ def room(configuration: AgentConfig) -> Iterator[Finding]:
 
 
 def renderer(configuration: AgentConfig) -> Iterator[Finding]:
-    """Check that MuJoCo can render, in a separate process: without a renderer its libraries abort the process."""
-    used = {entry.driver or _driver_of(entry) for entry in configuration.devices}
-    if "mujoco" not in used or importlib.util.find_spec("mujoco") is None:
+    """Check that MuJoCo can render, in a separate process: a wrong library can abort the process."""
+    if not bootstrap.simulates(configuration) or importlib.util.find_spec("mujoco") is None:
         return
-    chosen = os.environ.get("MUJOCO_GL", "")
-    if _renders({}):
-        yield ok("renderer", f"images can be rendered (MUJOCO_GL={chosen or 'not set'})")
-    elif _renders(_SOFTWARE):
-        settings = " ".join(f"{name}={value}" for name, value in _SOFTWARE.items())
-        message = f"images cannot be rendered with MUJOCO_GL={chosen or 'not set'}, but with {settings}"
-        yield warning("renderer", message, f"Set {settings} in the environment of the agent.")
-    else:
-        yield warning(
-            "renderer",
-            "simulated cameras provide no images; everything else works",
-            "Install a software renderer (Debian: apt-get install libosmesa6) and set MUJOCO_GL=osmesa.",
-        )
+    if name := _renders():
+        yield ok("renderer", f"{name} renders simulated cameras")
+        return
+    requested = os.environ.get("MUJOCO_GL", "")
+    unset = f"Unset MUJOCO_GL (now {requested}), or install" if requested else "Install"
+    yield warning(
+        "renderer",
+        "simulated cameras provide no images; everything else works",
+        f"{unset} a software renderer (Debian: apt-get install libosmesa6).",
+    )
 
 
-def _driver_of(entry: DeviceEntry) -> str:
-    try:
-        return catalogue.type_of(entry).driver
-    except ConfigError:
-        return ""
-
-
-def _renders(changes: Mapping[str, str]) -> bool:
+def _renders() -> str:
+    """Name of the library that renders in a child process, empty if none does."""
     try:
         completed = subprocess.run(  # noqa: S603 (a constant script, run by this interpreter)
-            [sys.executable, "-I", "-c", _RENDER],
-            env={**os.environ, **changes},
+            [sys.executable, "-c", _RENDER],
+            env=os.environ | {"PYTHONPATH": str(_ROOT)},
             stdin=subprocess.DEVNULL,
             capture_output=True,
+            text=True,
             timeout=_RENDER_S,
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired):
-        return False
-    return completed.returncode == 0
+        return ""
+    return completed.stdout.strip() if completed.returncode == 0 else ""

@@ -45,6 +45,7 @@ def test_start_and_clean_exit_keep_the_data(tmp_path: Path, broker: str) -> None
     with start_machine(tmp_path, TELESCOPE_BROKER=broker) as first:
         assert first.ready.count("\n") == 1
         assert f"{first.url}/ " in first.ready
+        assert "  renderer OSMesa (" in first.ready
         link = ready_link(first.ready)
         token = link.partition("#sign-in=")[2]
         assert httpx.post(f"{first.url}/api/v1/auth/sign-in", json={"link": token}).status_code == 200
