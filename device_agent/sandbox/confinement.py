@@ -4,7 +4,6 @@ Each requested layer is applied or raises: a script never runs with fewer layers
 """
 
 import contextlib
-import ctypes
 import os
 import resource
 import signal
@@ -12,7 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from device_agent.sandbox import landlock, seccomp
+from device_agent.sandbox import landlock, privileges, seccomp
 from device_agent.sandbox.constants import LANDLOCK, LIMITS, SECCOMP, USER
 
 SCRIPT_USER = 61_000
@@ -23,11 +22,6 @@ MAX_DESCRIPTORS = 256
 """The zygote's descriptors are below this number."""
 _NICENESS = 10
 """Scripts have a lower priority than the control loop."""
-_SET_PARENT_DEATH_SIGNAL, _SET_DUMPABLE, _DROP_BOUNDING, _SET_NO_NEW_PRIVILEGES, _AMBIENT = 1, 4, 24, 38, 47
-_AMBIENT_CLEAR_ALL = 4
-_LAST_CAPABILITY = 63
-
-_kernel = ctypes.CDLL(None, use_errno=True)
 
 
 class Unconfined(Exception):  # noqa: N818 (named after the state of the process)
@@ -50,18 +44,18 @@ def enter(link: int, parent: int, task: Mapping[str, Any], filter_: seccomp.Filt
     _close_other_descriptors(link)
     steps: tuple[tuple[str, Callable[[], None]], ...] = (
         (LIMITS, lambda: _limit(task["cpu_s"], task["memory_bytes"])),
-        (USER, _drop_privileges),
+        (USER, lambda: privileges.drop(SCRIPT_USER)),
         (LANDLOCK, landlock.restrict),
     )
     for layer, apply in steps:
         if layer in task["layers"]:
             _try(layer, apply)
     # After the change of user, which clears the signal.
-    _control(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+    privileges.control(privileges.SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
     if os.getppid() != parent:
         raise Unconfined("the zygote has ended")
     if SECCOMP in task["layers"]:
-        _try(SECCOMP, lambda: _lock(filter_))
+        _try(SECCOMP, lambda: seccomp.enforce(filter_))
 
 
 def _try(layer: str, apply: Callable[[], None]) -> None:
@@ -95,45 +89,3 @@ def _limit(cpu_s: int, memory_bytes: int) -> None:
         (resource.RLIMIT_NOFILE, LINK + 2),  # one more, for Landlock's ruleset
     ):
         resource.setrlimit(kind, (limit, limit))
-
-
-def _drop_privileges() -> None:
-    if os.geteuid() == 0:
-        # Older kernels know fewer capabilities.
-        for capability in range(_LAST_CAPABILITY + 1):
-            if _kernel.prctl(_DROP_BOUNDING, capability, 0, 0, 0) != 0:
-                break
-        os.setgroups([])
-        os.setresgid(SCRIPT_USER, SCRIPT_USER, SCRIPT_USER)
-        os.setresuid(SCRIPT_USER, SCRIPT_USER, SCRIPT_USER)
-    with contextlib.suppress(OSError):
-        _control(_AMBIENT, _AMBIENT_CLEAR_ALL)
-    _clear_capabilities()
-    _control(_SET_DUMPABLE, 0)
-    give_up_privileges()
-
-
-def _clear_capabilities() -> None:
-    """Clear all effective, permitted and inheritable capabilities, also of users other than root."""
-    header = (ctypes.c_uint32 * 2)(0x20080522, 0)
-    none = (ctypes.c_uint32 * 6)()
-    if _kernel.capset(header, none) != 0:
-        raise OSError(ctypes.get_errno(), "capabilities cannot be dropped")
-
-
-def _lock(filter_: seccomp.Filter | None) -> None:
-    if filter_ is None:
-        raise OSError("no filter")
-    filter_.load()
-    if not seccomp.in_force():
-        raise OSError("the filter is not active")
-
-
-def give_up_privileges() -> None:
-    """Set ``no_new_privs``, which Landlock and seccomp require."""
-    _control(_SET_NO_NEW_PRIVILEGES, 1)
-
-
-def _control(option: int, value: int) -> None:
-    if _kernel.prctl(option, value, 0, 0, 0) != 0:
-        raise OSError(ctypes.get_errno(), f"prctl {option}")

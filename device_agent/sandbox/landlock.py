@@ -1,14 +1,18 @@
-"""Landlock: denies this process all files, TCP ports and signals to other processes.
+"""Landlock: denies this process all files, TCP ports and signals to other processes, except reading named folders.
 
-The ruleset has no rules, so everything that the kernel's Landlock version can restrict is denied. Numbers are those of
-``linux/landlock.h``; the three system calls have the same number on all architectures.
+Everything that the kernel's Landlock version can restrict is denied. Numbers are those of ``linux/landlock.h``; the
+system calls have the same number on all architectures.
 """
 
 import ctypes
 import os
+import sys
+from collections.abc import Sequence
 
-_CREATE_RULESET, _RESTRICT_SELF = 444, 446
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
 _GET_VERSION = 1
+_BENEATH_A_FOLDER = 1
+_READ_FILE, _READ_FOLDER = 2**2, 2**3
 _FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 5: 16}
 """ABI version → number of file rights; each is one bit, without gaps."""
 _TCP_RIGHTS, _TCP_SINCE = 0b11, 4
@@ -24,8 +28,11 @@ def abi() -> int:
     return max(0, int(_kernel.syscall(_CREATE_RULESET, None, 0, _GET_VERSION)))
 
 
-def restrict() -> None:
+def restrict(readable: Sequence[str] = ()) -> None:
     """Apply the restrictions. Requires ``no_new_privs``.
+
+    Args:
+        readable: Folders whose content can be read.
 
     Raises:
         OSError: The kernel cannot apply them.
@@ -44,7 +51,20 @@ def restrict() -> None:
     if ruleset < 0:
         raise OSError(ctypes.get_errno(), "no Landlock")
     try:
+        for folder in readable:
+            _allow_reading(ruleset, folder)
         if _kernel.syscall(_RESTRICT_SELF, ruleset, 0) != 0:
             raise OSError(ctypes.get_errno(), "Landlock cannot be applied")
     finally:
         os.close(ruleset)
+
+
+def _allow_reading(ruleset: int, folder: str) -> None:
+    descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY)
+    try:
+        rule = (_READ_FILE | _READ_FOLDER).to_bytes(8, sys.byteorder)
+        rule += descriptor.to_bytes(4, sys.byteorder, signed=True)
+        if _kernel.syscall(_ADD_RULE, ruleset, _BENEATH_A_FOLDER, rule, 0) != 0:
+            raise OSError(ctypes.get_errno(), "Landlock cannot be applied")
+    finally:
+        os.close(descriptor)

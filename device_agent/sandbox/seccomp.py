@@ -1,6 +1,7 @@
-"""seccomp: the few system calls that a script process may use.
+"""seccomp: the few system calls that a confined process may use.
 
-The allow-list has no call that takes a path, creates a descriptor or a process, or reaches another process.
+The allow-list has no call that creates a socket or a process, or reaches another process. Scripts have no call that
+takes a path or creates a descriptor; a parser of files can also open files for reading, and start threads.
 ``libseccomp`` generates the filter for the machine's architecture; calls of other architectures (32-bit, x32) kill.
 """
 
@@ -29,6 +30,12 @@ _ALLOWED = (
     ("sched_getaffinity",),
     ("exit", "exit_group"),
 )
+_READING = (
+    ("fstat", "stat", "lstat", "newfstatat", "statx", "lseek", "pread64", "readv", "getdents64", "getcwd"),
+    ("readlink", "readlinkat", "access", "faccessat", "faccessat2", "dup"),
+    # Start of threads.
+    ("set_robust_list", "rseq", "membarrier"),
+)
 _DEADLY = (
     ("execve", "execveat", "ptrace", "process_vm_readv", "process_vm_writev", "pidfd_getfd", "kcmp"),
     ("mount", "umount2", "pivot_root", "chroot", "unshare", "setns", "open_tree", "move_mount", "fsopen", "fsmount"),
@@ -37,12 +44,17 @@ _DEADLY = (
     ("init_module", "finit_module", "delete_module", "kexec_load", "reboot", "swapon", "iopl", "ioperm"),
     ("modify_ldt", "name_to_handle_at", "open_by_handle_at", "fanotify_init", "quotactl", "acct", "settimeofday"),
 )
-"""Calls that no script makes by mistake: they kill the process. All other calls fail with EPERM."""
+"""Calls that no program makes by mistake: they kill the process. All other calls fail with EPERM."""
 _WRITABLE, _EXECUTABLE = 2, 4
+_ACCESS_MODE, _READ_ONLY = 3, 0
+_THREAD = 0x10000
 
 
-def build() -> Filter:
+def build(*, reading: bool = False) -> Filter:
     """Build the filter for this machine. It takes some milliseconds, so it is built once for all scripts.
+
+    Args:
+        reading: Allow opening files for reading, and threads.
 
     Raises:
         ImportError: ``pyseccomp`` is not installed.
@@ -57,6 +69,8 @@ def build() -> Filter:
         for name in (name for group in names for name in group):
             _add(library, filter_, action, name)
     _allow_memory(library, filter_)
+    if reading:
+        _allow_reading(library, filter_)
     # Reading a limit of this process; never setting one.
     _add(library, filter_, library.ALLOW, "prlimit64", library.Arg(0, library.EQ, 0), library.Arg(2, library.EQ, 0))
     return filter_  # type: ignore[no-any-return]
@@ -70,13 +84,36 @@ def _allow_memory(library: Any, filter_: Any) -> None:
     _add(library, filter_, library.ALLOW, "mprotect", library.Arg(2, library.MASKED_EQ, _EXECUTABLE, 0))
 
 
+def _allow_reading(library: Any, filter_: Any) -> None:
+    for name in (name for group in _READING for name in group):
+        _add(library, filter_, library.ALLOW, name)
+    for name, flags in (("open", 1), ("openat", 2)):
+        _add(library, filter_, library.ALLOW, name, library.Arg(flags, library.MASKED_EQ, _ACCESS_MODE, _READ_ONLY))
+    # The filter cannot read the flags of clone3. Without it, the C library uses clone.
+    _add(library, filter_, library.ERRNO(errno.ENOSYS), "clone3")
+    _add(library, filter_, library.ALLOW, "clone", library.Arg(0, library.MASKED_EQ, _THREAD, _THREAD))
+
+
 def _add(library: Any, filter_: Any, action: int, name: str, *arguments: Any) -> None:
     """Add a rule, unless this architecture or libseccomp does not know the call."""
     if library.resolve_syscall(library.system_arch(), name) >= 0:
         filter_.add_rule(action, name, *arguments)
 
 
-def in_force() -> bool:
+def enforce(filter_: Filter | None) -> None:
+    """Apply a filter to this process.
+
+    Raises:
+        OSError: There is none, or it is not active afterwards.
+    """
+    if filter_ is None:
+        raise OSError("no filter")
+    filter_.load()
+    if not _in_force():
+        raise OSError("the filter is not active")
+
+
+def _in_force() -> bool:
     """Whether the filter is active, tested with a denied call."""
     try:
         os.getpgid(0)

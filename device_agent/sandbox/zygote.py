@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-from device_agent.sandbox import confinement, importable_modules, landlock, script_process, seccomp
+from device_agent.sandbox import confinement, importable_modules, landlock, privileges, script_process, seccomp
 from device_agent.sandbox.constants import LANDLOCK, MAX_MESSAGE, SECCOMP
 
 _MAX_EXIT_CODES = 1000
@@ -59,7 +59,7 @@ class _Zygote:
         pid = os.fork()
         if pid == 0:
             try:
-                confinement.give_up_privileges()
+                privileges.renounce()
                 apply()
                 os._exit(0)
             finally:

@@ -78,4 +78,5 @@ class RobotTypeServices(TelemetryServices):
 
     @cached_property
     def model_checks(self) -> ModelValidator:
-        return ModelValidator(tables=self.tables, blobs=self.blobs, compiler=MujocoCompiler(), clock=self.clock)
+        compiler = MujocoCompiler(allow_unconfined=self.settings.allow_unconfined_models)
+        return ModelValidator(tables=self.tables, blobs=self.blobs, compiler=compiler, clock=self.clock)

@@ -31,6 +31,10 @@ class CompilerMissingError(Exception):
     """No model compiler is available; the text says what to install."""
 
 
+class UnconfinedError(CompilerMissingError):
+    """The compiler cannot be confined on this machine; the text names the missing layers and the remedy."""
+
+
 class ModelCompiler(Protocol):
     """Compiles untrusted model files in a sandbox that reads nothing else. Stateless; safe to retry.
 
@@ -39,8 +43,8 @@ class ModelCompiler(Protocol):
         report = await compiler.check(robot_type, files)
     """
 
-    def require(self) -> None:
-        """Check that the compiler is available.
+    async def require(self) -> None:
+        """Check that the compiler is available, and confined.
 
         Raises:
             CompilerMissingError: It is not available.

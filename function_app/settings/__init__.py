@@ -77,6 +77,7 @@ class Settings:
         console: Folder of the built console.
         trusted_proxies: Number of own proxies in front of the API. They append the last addresses of
             ``X-Forwarded-For``.
+        allow_unconfined_models: Check uploaded models even where their parser cannot be confined.
     """
 
     home: Path
@@ -98,6 +99,7 @@ class Settings:
     console: Path = CONSOLE
     trusted_proxies: int = 0
     connections: ConnectionSettings = field(default_factory=ConnectionSettings)
+    allow_unconfined_models: bool = False
     rate_limits: RateLimits = field(default_factory=RateLimits)
     retention: RetentionPeriods = field(default_factory=RetentionPeriods)
 
@@ -138,6 +140,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         console=env.folder("TELESCOPE_CONSOLE", CONSOLE),
         trusted_proxies=env.number("TELESCOPE_TRUSTED_PROXIES", 0, 0, 10),
         connections=read_connections(env),
+        allow_unconfined_models=env.number("TELESCOPE_ALLOW_UNCONFINED_MODELS", 0, 0, 1) == 1,
         rate_limits=read_rate_limits(env),
         retention=read_retention(env),
     )

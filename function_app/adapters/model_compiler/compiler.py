@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import importlib.util
 import json
+import logging
 import os
 import shutil
 import signal
@@ -11,50 +12,55 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from device_agent.protocol.manifests.robot_type import RobotType
-from function_app.ports.model_compiler import CompilerMissingError, ModelReport
+from function_app.ports.model_compiler import CompilerMissingError, ModelReport, UnconfinedError
 
 CPU_S = 15
 WALL_S = 30
 MEMORY_MB = 1024
-_NO_MUJOCO = 3
-"""Exit code of the worker. Not imported from there, because the import would slow down a cold start."""
+USER = 61_001
+"""User and group of the child if the server runs as root: unused by accounts, and not that of scripts."""
+_NO_MUJOCO, _UNCONFINED = 3, 4
+"""Exit codes of the worker. Not imported from there, because the import would slow down a cold start."""
 _CHILD = Path(__file__).with_name("worker.py")
 _MISSING = "MuJoCo is not installed here; install the packages of requirements/local.txt, or run the checker elsewhere"
+_REMEDY = (
+    "Check models on Linux 5.13 or newer with Landlock and seccomp. If you trust every account, set "
+    "TELESCOPE_ALLOW_UNCONFINED_MODELS=1."
+)
 _TOO_LONG = f"The model takes MuJoCo more than {CPU_S} s. Simplify it."
 _CRASHED = f"MuJoCo ended while it read the model, or needed more than {MEMORY_MB} MB of memory. Simplify it."
+
+_log = logging.getLogger(__name__)
 
 
 class MujocoCompiler:
     """``ModelCompiler`` with one child process and one temporary folder per model.
 
     Args:
+        allow_unconfined: Check models even if the machine cannot confine the child, with the layers that it has.
         cpu_s: Maximum processor time per model [s].
         wall_s: Maximum elapsed time per model [s].
     """
 
-    def __init__(self, *, cpu_s: int = CPU_S, wall_s: int = WALL_S) -> None:
+    def __init__(self, *, allow_unconfined: bool = False, cpu_s: int = CPU_S, wall_s: int = WALL_S) -> None:
+        self._allow_unconfined = allow_unconfined
         self._cpu_s = cpu_s
         self._wall_s = wall_s
 
-    def require(self) -> None:
-        if importlib.util.find_spec("mujoco") is None:
-            raise CompilerMissingError(_MISSING)
+    async def require(self) -> None:
+        _, output = await self._compile({}, {})
+        if lacks := _lacks(output):
+            _log.warning("uploaded models are checked with %s, as TELESCOPE_ALLOW_UNCONFINED_MODELS allows", lacks)
 
     async def check(
         self, robot_type: RobotType, files: Mapping[str, bytes], missing: Sequence[str] = ()
     ) -> ModelReport:
-        self.require()
-        folder = await asyncio.to_thread(_write, files)
-        try:
-            code, output = await self._run(folder, self._task(robot_type, missing))
-        finally:
-            await asyncio.shield(asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True))
-        if code == _NO_MUJOCO:
-            raise CompilerMissingError(_MISSING)
+        code, output = await self._compile(_task(robot_type, missing), files)
         if code in {-signal.SIGKILL, -signal.SIGXCPU, -signal.SIGALRM}:
             return ModelReport((_TOO_LONG,))
         try:
@@ -62,15 +68,28 @@ class MujocoCompiler:
         except msgspec.DecodeError:
             return ModelReport((_CRASHED,))
 
-    def _task(self, robot_type: RobotType, missing: Sequence[str]) -> bytes:
-        manifest = msgspec.to_builtins(robot_type)
-        names = ("type", "model", "scene", "joints", "frames", "home_rad")
-        wheels = (manifest["simulation"] or {}).get("wheels") or {}
+    async def _compile(self, task: Mapping[str, Any], files: Mapping[str, bytes]) -> tuple[int, bytes]:
+        """Run a child process; returns its exit code and output.
+
+        Raises:
+            CompilerMissingError: There is no MuJoCo, or the child cannot be confined.
+        """
+        if importlib.util.find_spec("mujoco") is None:
+            raise CompilerMissingError(_MISSING)
         limits = {"cpu_s": self._cpu_s, "wall_s": self._wall_s + 5, "memory_mb": MEMORY_MB}
-        sides = [wheels[side] for side in ("left", "right") if side in wheels]
-        return json.dumps(
-            {**{name: manifest[name] for name in names}, "wheels": sides, "missing": missing, **limits}
-        ).encode()
+        confinement = {"user": USER, "allow_unconfined": self._allow_unconfined}
+        folder = await asyncio.to_thread(_write, files)
+        try:
+            code, output = await self._run(folder, json.dumps({**task, **limits, **confinement}).encode())
+        finally:
+            await asyncio.shield(asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True))
+        if code == _NO_MUJOCO:
+            raise CompilerMissingError(_MISSING)
+        if code == _UNCONFINED:
+            raise UnconfinedError(
+                f"this machine cannot confine the check of uploaded models: {_lacks(output)}. {_REMEDY}"
+            )
+        return code, output
 
     async def _run(self, folder: Path, task: bytes) -> tuple[int, bytes]:
         process = await asyncio.create_subprocess_exec(
@@ -97,6 +116,19 @@ class MujocoCompiler:
         return process.returncode or 0, output
 
 
+def _task(robot_type: RobotType, missing: Sequence[str]) -> dict[str, Any]:
+    manifest = msgspec.to_builtins(robot_type)
+    names = ("type", "model", "scene", "joints", "frames", "home_rad")
+    wheels = (manifest["simulation"] or {}).get("wheels") or {}
+    sides = [wheels[side] for side in ("left", "right") if side in wheels]
+    return {**{name: manifest[name] for name in names}, "wheels": sides, "missing": list(missing)}
+
+
+def _lacks(output: bytes) -> str:
+    """The layers that the child could not apply, with the reasons."""
+    return ", ".join(f"no {layer} ({reason})" for layer, reason in json.loads(output)["missing"].items())
+
+
 def _write(files: Mapping[str, bytes]) -> Path:
     """A temporary folder with these files. Checks the names again, although the caller has validated them."""
     folder = Path(tempfile.mkdtemp(prefix="telescope-model-")).resolve()
@@ -107,4 +139,7 @@ def _write(files: Mapping[str, bytes]) -> Path:
             raise ValueError(f"'{name}' is outside the folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
+    if os.geteuid() == 0:
+        for path in (folder, *folder.rglob("*")):
+            os.chown(path, USER, USER)
     return folder

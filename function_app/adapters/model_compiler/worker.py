@@ -4,7 +4,6 @@ Runs as ``python -I -B worker.py`` in a folder that contains only the uploaded f
 input, sets its resource limits before it opens a file, and writes a ``ModelReport`` as JSON.
 """
 
-import ctypes
 import json
 import os
 import resource
@@ -12,9 +11,10 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-NO_MUJOCO = 3
+T = TypeVar("T")
+NO_MUJOCO, UNCONFINED = 3, 4
 _MEGABYTE = 2**20
 _STEPS = 100
 _TIMESTEP_S = 0.002
@@ -26,10 +26,6 @@ _MAX_BODIES = 500
 _MAX_SHAPES = 2000
 _MAX_NAMES = 200
 _LEAST_MASS_KG, _LEAST_INERTIA_KG_M2 = 1e-3, 1e-6
-_LANDLOCK_CREATE, _LANDLOCK_ADD, _LANDLOCK_RESTRICT = 444, 445, 446
-_NO_NEW_PRIVILEGES = 38
-_ALL_FILE_RIGHTS = 2**13 - 1
-_READ_RIGHTS = 2**2 | 2**3
 
 
 def limit(cpu_s: int, wall_s: int, memory_mb: int) -> None:
@@ -45,22 +41,35 @@ def limit(cpu_s: int, wall_s: int, memory_mb: int) -> None:
     signal.alarm(wall_s)  # also if the parent process has ended
 
 
-def confine(folder: str) -> None:
-    """Restrict file access to this folder with Landlock.
+def confine(folder: str, user: int) -> dict[str, str]:
+    """Confine this process to reading a folder: another user, Landlock, seccomp, in this order.
 
-    On kernels without Landlock, only the earlier validation of references in the XML protects other files.
+    Args:
+        folder: The folder.
+        user: User and group, if the server runs as root.
+
+    Returns:
+        Layer → why it could not be applied; empty if all layers are in force.
     """
-    calls = ctypes.CDLL(None)
-    rights = ctypes.c_uint64(_ALL_FILE_RIGHTS)
-    rules = calls.syscall(_LANDLOCK_CREATE, ctypes.byref(rights), ctypes.sizeof(rights), 0)
-    if rules < 0:
-        return
-    descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY)
-    rule = _READ_RIGHTS.to_bytes(8, sys.byteorder) + descriptor.to_bytes(4, sys.byteorder, signed=True)
-    calls.syscall(_LANDLOCK_ADD, rules, 1, rule, 0)
-    calls.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)
-    calls.syscall(_LANDLOCK_RESTRICT, rules, 0)
-    os.close(rules)
+    if sys.platform != "linux":
+        return {"Linux": f"it runs {sys.platform}"}
+    from device_agent.sandbox import landlock, privileges, seccomp  # noqa: PLC0415 (Linux only)
+
+    missing: dict[str, str] = {}
+
+    def attempt(layer: str, step: Callable[[], T]) -> T | None:
+        try:
+            return step()
+        except (ImportError, OSError, RuntimeError, ValueError) as error:
+            missing[layer] = str(error)
+            return None
+
+    filter_ = attempt("seccomp", lambda: seccomp.build(reading=True))  # loads files
+    attempt("user", lambda: privileges.drop(user))
+    attempt("landlock", lambda: landlock.restrict([folder]))
+    if filter_ is not None:
+        attempt("seccomp", lambda: seccomp.enforce(filter_))
+    return missing
 
 
 class Check:
@@ -261,19 +270,43 @@ def _inside(what: str, limits: Any, joint: dict[str, Any]) -> Iterator[str]:
 
 
 def main() -> int:
-    """Check the task on standard input; returns 0 if a report was written."""
+    """Check the task on standard input; returns 0 if a report was written, which is empty for a task without a type."""
     task = json.load(sys.stdin)
     limit(task["cpu_s"], task["wall_s"], task["memory_mb"])
     output = os.dup(1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # MuJoCo may print to standard output
     sys.path.append(str(Path(__file__).resolve().parents[3]))
     try:
-        import msgspec  # noqa: PLC0415
-        import mujoco  # noqa: PLC0415 (within the limits)
-
-        from device_agent.simulation.mjcf.twin import build_twin  # noqa: PLC0415 (needs MuJoCo)
+        report, code = _check(task), 0
     except ImportError:
         return NO_MUJOCO
+    except Unconfined as error:
+        report, code = {"missing": error.missing}, UNCONFINED
+    with os.fdopen(output, "wb") as file:
+        file.write(json.dumps(report).encode())
+    return code
+
+
+class Unconfined(Exception):  # noqa: N818 (named after the state of the process)
+    """Layers are missing, and the task does not accept this."""
+
+    def __init__(self, missing: dict[str, str]) -> None:
+        super().__init__()
+        self.missing = missing
+
+
+def _check(task: dict[str, Any]) -> dict[str, Any]:
+    """The report about the task's model.
+
+    Raises:
+        ImportError: MuJoCo is not installed.
+        Unconfined: This process cannot be confined.
+    """
+    import msgspec  # noqa: PLC0415
+    import mujoco  # noqa: PLC0415 (within the limits)
+
+    from device_agent.simulation.mjcf.twin import build_twin  # noqa: PLC0415 (needs MuJoCo)
+
     mujoco_warnings: list[str] = []
 
     def warn(text: object) -> None:  # without a handler, MuJoCo writes a log file
@@ -281,20 +314,22 @@ def main() -> int:
             mujoco_warnings.append(str(text))
 
     mujoco.set_mju_user_warning(warn)
-    confine(".")
+    # All modules are loaded. From here on, the process reads only the model.
+    missing = confine(".", task["user"])
+    if missing and not task["allow_unconfined"]:
+        raise Unconfined(missing)
+    if "type" not in task:
+        return {"missing": missing}
     check = Check(mujoco, build_twin, task)
     try:
         errors = check.errors()
     except MemoryError:
         errors = [f"The model needs more than {task['memory_mb']} MB of memory."]
-    report = {
+    return {
         "errors": [error[:2000] for error in errors[:50]],
         "warnings": [text[:2000] for text in (*check.warnings, *mujoco_warnings)[:50]],
-        **check.description,
+        **msgspec.to_builtins(check.description),
     }
-    with os.fdopen(output, "wb") as file:
-        file.write(msgspec.json.encode(report))
-    return 0
 
 
 if __name__ == "__main__":

@@ -54,9 +54,9 @@ async def check_models(functions: Functions, *, drain: bool) -> None:
     """Check uploaded models, until none is left (``drain``) or without end.
 
     Raises:
-        CompilerMissingError: MuJoCo is not installed.
+        CompilerMissingError: MuJoCo is not installed, or cannot be confined.
     """
-    functions.model_checks.require()
+    await functions.model_checks.require()
     while True:
         try:
             busy = await functions.model_checks.run()
@@ -71,7 +71,7 @@ async def check_models(functions: Functions, *, drain: bool) -> None:
 
 
 async def _check_models(functions: Functions) -> None:
-    """Check models if MuJoCo is installed; a worker without it runs the other tasks."""
+    """Check models if MuJoCo is installed and confined; another worker runs the other tasks."""
     try:
         await check_models(functions, drain=False)
     except CompilerMissingError as error:

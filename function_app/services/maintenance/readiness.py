@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from function_app.ports.command_bus import CommandBus
 from function_app.ports.tables import StoreError, Tables
+from function_app.services.robot_types.rows import read_refusal
 from function_app.services.storage import records
 
 
@@ -13,6 +14,7 @@ class Health:
 
     tables: str
     broker: str
+    models: str = "ok"
 
 
 class ReadinessCheck:
@@ -28,7 +30,8 @@ class ReadinessCheck:
             await self.require_tables()
         except StoreError as error:
             return Health(tables=str(error), broker=await self._bus.status())
-        return Health(tables="ok", broker=await self._bus.status())
+        refusal = await read_refusal(self._tables)
+        return Health(tables="ok", broker=await self._bus.status(), models=refusal or "ok")
 
     async def require_tables(self) -> None:
         """Read a row."""

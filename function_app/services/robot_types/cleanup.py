@@ -17,6 +17,7 @@ from function_app.services.robot_types.rows import (
     place_of,
     preview_index,
     read_head,
+    read_refusal,
     schedule_check,
 )
 from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_PREVIEW_MS
@@ -116,8 +117,11 @@ class RobotTypeCleanup:
         elif version.state == "checking" and age_ms < LONGEST_MS and await self._busy(now_ms):
             await schedule_check(self._tables, where, now_ms + RETRY_MS)
         else:
-            why = INTERRUPTED if version.state == "uploading" else NO_VALIDATOR
-            await store_verdict(self._tables, where, version.version, (why,), now_ms)
+            reason = INTERRUPTED
+            if version.state == "checking":
+                refusal = await read_refusal(self._tables)
+                reason = f"The model was not checked: {refusal}" if refusal else NO_VALIDATOR
+            await store_verdict(self._tables, where, version.version, (reason,), now_ms)
 
     async def _busy(self, now_ms: int) -> bool:
         """Whether a validator is working, so that this upload will get its turn."""

@@ -5,7 +5,7 @@ A job is leased by its ETag, so two validators never have the same job. The job 
 
 import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Sequence
 from dataclasses import replace
 
 import msgspec
@@ -14,10 +14,21 @@ from device_agent.protocol.manifests.robot_type import MANIFEST, RobotType
 from function_app.domain.robot_types.robot_types import State, TypeVersion, with_ready
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
-from function_app.ports.model_compiler import CompilerMissingError, ModelCompiler, ModelReport
+from function_app.ports.model_compiler import CompilerMissingError, ModelCompiler, ModelReport, UnconfinedError
 from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services.robot_types.package_reader import malformed, missing
-from function_app.services.robot_types.rows import CHECKS, HEAD, REPORT, Place, read_head, read_version, schedule_check
+from function_app.services.robot_types.rows import (
+    CHECKS,
+    HEAD,
+    REPORT,
+    Place,
+    after_account,
+    job_target,
+    read_head,
+    read_version,
+    record_refusal,
+    schedule_check,
+)
 from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS
 
@@ -39,14 +50,21 @@ class ModelValidator:
         self._blobs = blobs
         self._compiler = compiler
         self._clock = clock
+        self._next = ""
 
-    def require(self) -> None:
-        """Check that models can be compiled here.
+    async def require(self) -> None:
+        """Check that models can be compiled here. A machine that cannot confine the compiler is recorded.
 
         Raises:
-            CompilerMissingError: There is no compiler.
+            CompilerMissingError: There is no compiler, or it cannot be confined.
+            StoreError: The stores are not available.
         """
-        self._compiler.require()
+        try:
+            await self._compiler.require()
+        except UnconfinedError as error:
+            await record_refusal(self._tables, str(error))
+            raise
+        await record_refusal(self._tables, "")
 
     async def run(self) -> bool:
         """Process one job; return whether there was one.
@@ -55,14 +73,14 @@ class ModelValidator:
             CompilerMissingError: There is no compiler; the job is released.
             StoreError: The stores are not available.
         """
-        page = await self._tables.query(records.MODEL_CHECKS, CHECKS, limit=100)
-        for note in page.rows:
+        async for note in self._in_turn():
             if note.data["until_ms"] > self._clock.now_ms():
                 continue
             try:
                 taken = await self._take(note)
             except Conflict:
                 continue  # taken by another validator
+            self._next = after_account(note)
             try:
                 await self._check(taken)
                 await self._tables.delete(records.MODEL_CHECKS, taken)
@@ -74,13 +92,19 @@ class ModelValidator:
             return True
         return False
 
+    async def _in_turn(self) -> AsyncIterator[Row]:
+        """The jobs, beginning with those of the next account: accounts take turns, however many jobs each has."""
+        for first in (self._next, ""):
+            async for note in records.all_rows(self._tables, records.MODEL_CHECKS, CHECKS, first=first):
+                yield note
+
     async def _take(self, note: Row) -> Row:
         until_ms = self._clock.now_ms() + LEASE_MS
         data = {**note.data, "until_ms": until_ms, "tries": note.data["tries"] + 1}
         return await self._tables.replace(records.MODEL_CHECKS, replace(note, data=data))
 
     async def _check(self, note: Row) -> None:
-        where, number = _target(note)
+        where, number = job_target(note)
         _, upload = await read_version(self._tables, where, number)
         if upload is not None and upload.state == "checking":
             if note.data["tries"] > MAX_TRIES:
@@ -156,9 +180,3 @@ def _file(error: str) -> str:
 
 def _sentence(error: str) -> str:
     return error[:MAX_ERROR] + " …" if len(error) > MAX_ERROR else error.rstrip(".") + "."
-
-
-def _target(note: Row) -> tuple[Place, int]:
-    place, _, version = note.key.partition(":")[2].rpartition(":")
-    account, _, robot_type = place.partition("/")
-    return Place(account, robot_type), int(version)

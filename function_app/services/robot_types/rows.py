@@ -1,7 +1,8 @@
 """Rows of an account's robot types, and the reminders for validation and cleanup.
 
-Each type has its own partition and blob prefix. In ``ModelChecks``, partition ``checks`` contains validation jobs, and
-partition ``looks`` contains cleanup reminders, which also complete interrupted operations.
+Each type has its own partition and blob prefix. In ``ModelChecks``, partition ``checks`` contains validation jobs by
+account, oldest first. Partition ``looks`` contains cleanup reminders, which also complete interrupted operations.
+Partition ``validators`` has a row while the validator that started last cannot confine its compiler.
 """
 
 from dataclasses import dataclass
@@ -16,11 +17,19 @@ HEAD = "type"
 VERSIONS = "version:"
 CHECKS = "checks"
 LOOKS = "looks"
+VALIDATORS = "validators"
 INDEX = "type:"
 REPORT = "looked.json"
 """Name of the stored ``ModelReport`` of a version. No uploaded file can have this name."""
 PREVIEWS = "type-look:"
 _PREVIEW = "~"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """The reason of a validator that does not check models."""
+
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +84,39 @@ async def read_version(tables: Tables, where: Place, version: int) -> tuple[Row 
     """The row of a version, and its content."""
     row = await tables.get(records.ROBOT_TYPES, where.partition, version_key(version))
     return row, None if row is None else records.read(row, TypeVersion)
+
+
+async def add_job(tables: Tables, where: Place, version: int, now_ms: int) -> None:
+    """Create a validation job."""
+    key = f"{where.account}/{now_ms:013d}:{where.type}:{version}"
+    await tables.create(records.MODEL_CHECKS, Row(CHECKS, key, {"version": version, "until_ms": 0, "tries": 0}))
+
+
+def job_target(job: Row) -> tuple[Place, int]:
+    """The place and version that a job validates."""
+    account, _, rest = job.key.partition("/")
+    robot_type, _, version = rest.partition(":")[2].rpartition(":")
+    return Place(account, robot_type), int(version)
+
+
+def after_account(job: Row) -> str:
+    """The least key after all jobs of the account of this job."""
+    return job.key.partition("/")[0] + chr(ord("/") + 1)
+
+
+async def record_refusal(tables: Tables, reason: str) -> None:
+    """Record why the validator does not check models; empty: it does."""
+    refusal = Refusal(reason)
+    if reason:
+        await records.upsert(tables, records.MODEL_CHECKS, VALIDATORS, "refusal", lambda _: refusal, Refusal)
+    else:
+        await records.remove(tables, records.MODEL_CHECKS, VALIDATORS, "refusal")
+
+
+async def read_refusal(tables: Tables) -> str:
+    """Why the validator does not check models; empty if there is no such reason."""
+    _, refusal = await records.find(tables, records.MODEL_CHECKS, VALIDATORS, "refusal", Refusal)
+    return "" if refusal is None else refusal.reason
 
 
 async def schedule_check(tables: Tables, where: Place, due_ms: int) -> None:

@@ -10,7 +10,7 @@ from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.robot_types.model_validation import drop_files
-from function_app.services.robot_types.rows import CHECKS, Place, read_version
+from function_app.services.robot_types.rows import Place, add_job, read_version
 from function_app.services.storage import records as store
 
 GIVE_UP_MS = 120_000
@@ -47,8 +47,7 @@ class TypeVersions:
             # The version was rejected or the type deleted: the files are not needed.
             await drop_files(self._blobs, where, version)
             raise busy_store()
-        key = f"{self._clock.now_ms():013d}:{where.partition}:{version}"
-        await self._tables.create(store.MODEL_CHECKS, Row(CHECKS, key, {"version": version, "until_ms": 0, "tries": 0}))
+        await add_job(self._tables, where, version, self._clock.now_ms())
 
     async def verdict(self, where: Place, version: int, wait_ms: int) -> TypeVersion | None:
         """The version after its validation, or after ``wait_ms``."""

@@ -16,15 +16,19 @@ def router(functions: Functions, _auth: RequestAuthenticator) -> Routes:
 
     @routes.add("GET /health", "Check the server", schemas.HealthOut, caller="anonymous")
     async def health(_request: Request) -> Response:
-        """503: the tables are not available. ``degraded``: the broker is not reachable; the server reconnects."""
+        """503: the tables are not available.
+
+        ``degraded``: the broker is not reachable, and the server reconnects; or uploaded models are not checked.
+        """
         result = await functions.health.check()
         if result.tables != "ok":
             raise store_unavailable(result.tables)
         body = schemas.HealthOut(
-            status="ok" if result.broker == "ok" else "degraded",
+            status="ok" if result.broker == result.models == "ok" else "degraded",
             version=VERSION,
             tables=result.tables,
             broker=result.broker,
+            models=result.models,
         )
         return json_response(body)
 

@@ -124,9 +124,10 @@ class DeviceHealthList(Response, frozen=True, kw_only=True):
 
 
 class HealthOut(Response, frozen=True, kw_only=True):
-    """Health of the server. ``tables`` and ``broker``: ``ok``, or a description of the error."""
+    """Health of the server. ``tables``, ``broker``, and the check of ``models``: ``ok``, or the error."""
 
     status: Literal["ok", "degraded"]
     version: str
     tables: str
     broker: str
+    models: str
