@@ -26,6 +26,7 @@ from device_agent.protocol.manifests.shipped import ROBOTS
 from device_agent.runtime.agent import Agent
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.device import Device
+from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.runtime.storage.journal import Journal
@@ -265,6 +266,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
     outbox = _outbox(store, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
     sandbox = SandboxHost(allow_unconfined=configuration.allow_unconfined_scripts)
     uploads = HttpUploads(pairing.agent, lambda: cloud_client(store, configuration, clock))
+    load = LoadGovernor()
     devices: dict[str, Device] = {}
     neighbours: dict[str, RoomDriver] = {}
     for entry in configuration.devices:
@@ -286,6 +288,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
             trace=trace,
             faults=store.faults,
             uploads=uploads,
+            load=load,
         )
     agent = Agent(devices, transport, outbox=outbox, readings=readings, address=(pairing.space, pairing.agent))
     return RunningAgent(agent, journal, monitor, sandbox)
@@ -353,6 +356,7 @@ def _device(
     trace: Path | None,
     faults: Path,
     uploads: Uploads,
+    load: LoadGovernor,
 ) -> Device:
     kind = type_of(entry)
     return Device(
@@ -375,6 +379,7 @@ def _device(
         owner=pairing.owner,
         speech=Espeak(),
         uploads=uploads,
+        load=load,
     )
 
 

@@ -101,6 +101,14 @@ class Image:
 
 
 @runtime_checkable
+class Reducible(Protocol):
+    """A driver with work of its own that can run less often on an overloaded machine."""
+
+    def reduce(self, share: float) -> None:
+        """Run the work at this share of its rate, from 0 (excluded) to 1. Quick; called often."""
+
+
+@runtime_checkable
 class RoomDriver(Protocol):
     """Driver of one room device.
 

@@ -107,6 +107,10 @@ class State(Struct, frozen=True, kw_only=True):
         ended_epoch: Highest epoch that the device no longer accepts. It only rises, so even an outdated message
             correctly marks the leases that have ended.
         stiffness: Joints that hold with reduced strength: joint name → share of the full strength.
+        load: Which work the agent reduces because its machine is overloaded: 0: none; 1: cameras; 2: also perception;
+            3: also telemetry. Control is never reduced.
+        rates_hz: Measured rate of each stream and camera: ``tele/joints``, ``cam/front`` → messages a second [Hz]. The
+            configured rates are in ``desc``.
     """
 
     device: Id
@@ -121,3 +125,5 @@ class State(Struct, frozen=True, kw_only=True):
     faults: tuple[Fault, ...] = ()
     restrictions: tuple[Restriction, ...] = ()
     stiffness: dict[str, float] = {}
+    load: Count = 0
+    rates_hz: dict[str, float] = {}

@@ -37,6 +37,7 @@ from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.control.control_loop import ControlLoop
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
+from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.runtime.room.sensor_loop import SensorLoop
@@ -81,12 +82,16 @@ class Device:
         obstacle_map: Callable[[], ObstacleMap | None] | None = None,
         speech: Speech | None = None,
         uploads: Uploads | None = None,
+        load: LoadGovernor | None = None,
     ) -> None:
         self.name = name
+        self._load = load or LoadGovernor()
         self._driver = driver
         self._sandbox = sandbox
         self._readings = readings
         room_device = driver if isinstance(driver, RoomDevice) else None
+        if room_device is not None:
+            room_device.load = self._load
         record = journal.device(name)
         gate = LeaseGate(epoch=record.epoch, burned=record.epoch)  # a restart ends every lease
         self._events = EventRecorder()
@@ -95,7 +100,11 @@ class Device:
         )
         self._controller.changed.set()
         self._stream_sampler = StreamSampler(
-            robot_type.streams, driver if isinstance(driver, ReportsStreams) else None, name=name, publish=self._publish
+            robot_type.streams,
+            driver if isinstance(driver, ReportsStreams) else None,
+            name=name,
+            publish=self._publish,
+            load=self._load,
         )
         context = DeviceContext(
             robot_type=robot_type,
@@ -136,6 +145,7 @@ class Device:
             name=name,
             publish=self.publisher.publish_frame,
             is_controlled=lambda: self._controller.lease(time.monotonic()) is not None,
+            load=self._load,
         )
         self._interlocks = Interlocks(
             interlocks,
@@ -160,6 +170,7 @@ class Device:
             keys=keys,
             wake=self._wake,
             device_faults=tuple if room_device is None else room_device.watchdog.faults,
+            load=self._load,
         )
 
     def _create_loop(self, driver: Driver | RoomDevice, robot_type: RobotType) -> ControlLoop | SensorLoop:
@@ -179,6 +190,7 @@ class Device:
             name=self.name,
             publish=lambda telemetry: self._publish(topics.JOINTS, telemetry),
             check_interlocks=self._interlocks.update,
+            load=self._load,
         )
 
     # ------------------------------------------------------------ start and stop

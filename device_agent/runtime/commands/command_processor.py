@@ -41,6 +41,7 @@ from device_agent.runtime.authority.event_recorder import EventRecord, EventReco
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
+from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.storage.journal import Journal, JournalError
 from device_agent.runtime.telemetry.device_publisher import DevicePublisher, StateSnapshot
 
@@ -65,6 +66,7 @@ class CommandProcessor:
         cloud_clock: CloudClock,
         keys: PinnedKeys,
         wake: Callable[[], None],
+        load: LoadGovernor,
         device_faults: Callable[[], tuple[Fault, ...]] = tuple,
     ) -> None:
         self._address = address
@@ -77,6 +79,7 @@ class CommandProcessor:
         self._cloud_clock = cloud_clock
         self._keys = keys
         self._wake = wake
+        self._load = load
         self._device_faults = device_faults
         self._control_request = PendingControlRequest()
         self._twin: Twin | None = None
@@ -297,4 +300,5 @@ class CommandProcessor:
                 for item in self._controller.restrictions
             ),
             stiffness=self._controller.reduced_stiffness,
+            load=self._load.level,
         )

@@ -19,6 +19,7 @@ from device_agent.protocol import JointTelemetry, Mode
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.load import LoadGovernor
 
 IDLE_RATE_HZ = 20.0
 MOVING_RATE_HZ = 50.0
@@ -51,7 +52,9 @@ class ControlLoop:
         name: str,
         publish: Callable[[JointTelemetry], None],
         check_interlocks: Callable[[float], None],
+        load: LoadGovernor,
     ) -> None:
+        self._load = load
         self._period_s = robot_type.period_ms / 1000
         self._driver = driver
         self._base = driver if robot_type.base is not None and isinstance(driver, MobileDriver) else None
@@ -148,6 +151,8 @@ class ControlLoop:
     def _run_period(self, *, early: bool) -> None:
         """Observe, compute, command, publish; sets ``_error`` on failure. The caller holds the period lock."""
         now_s = time.monotonic()
+        if not early:
+            self._load.record_period(now_s, late_s=now_s - self._next_s, period_s=self._period_s)
         self._requested.clear()  # this period includes all requests so far
         try:
             # A device at rest is where the previous period observed it.
@@ -239,7 +244,8 @@ class ControlLoop:
             self._next_telemetry_s = now_s + _STREAMING_GAP_S
         else:
             busy = output.mode is Mode.ACTION or self._controller.moving
-            due_s = min(self._next_telemetry_s, now_s) + (gap_s if busy else 1 / IDLE_RATE_HZ)
+            regular_s = (gap_s if busy else 1 / IDLE_RATE_HZ) / self._load.share("telemetry")
+            due_s = min(self._next_telemetry_s, now_s) + regular_s
             self._next_telemetry_s = max(now_s, due_s)
         self._budget_s = max(self._budget_s, now_s) + gap_s
         self._published_setpoint = output.setpoint_sequence

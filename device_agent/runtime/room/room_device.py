@@ -12,6 +12,7 @@ from device_agent.ports.uploads import UploadError, Uploads
 from device_agent.protocol.commands import CaptureRaw, CollectData, SetControl, TakePicture
 from device_agent.protocol.manifests.room import Control, RoomDeviceManifest
 from device_agent.runtime.errors import Refused
+from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.room.stream_watchdog import StreamWatchdog
 
 _SUFFIXES = {"image/png": "png", "image/jpeg": "jpg", "application/json": "json"}
@@ -26,6 +27,7 @@ class RoomDevice:
         manifest: Manifest of the device.
         streams: Names of the streams.
         cameras: Names of the cameras.
+        load: Reduces rates on an overloaded machine; the device replaces it by the agent's.
         watchdog: Detects silent or stuck streams and cameras.
         rates_changed: Set when a rate has changed; the sensor loop clears it.
     """
@@ -34,6 +36,7 @@ class RoomDevice:
         self.driver = driver
         self.manifest = manifest
         self._uploads = uploads
+        self.load = LoadGovernor()
         self._collecting: Mapping[str, float] = {}
         self._counts: Counter[str] = Counter()
         self.watchdog = StreamWatchdog(manifest.watch, self.rate_hz)
@@ -69,7 +72,8 @@ class RoomDevice:
         if rate_hz is not None:
             return rate_hz
         sources = (*self.manifest.streams, *self.manifest.cameras)
-        return max(_MIN_RATE_HZ, next(source.rate_hz for source in sources if source.name == name))
+        share = self.load.share("cameras" if name in self.cameras else "telemetry")
+        return max(_MIN_RATE_HZ, share * next(source.rate_hz for source in sources if source.name == name))
 
     def collect(self, streams: Collection[str], rate_hz: float) -> tuple[str, ...]:
         """Read these streams, or all if none is named, at a rate until ``idle``; returns their names.

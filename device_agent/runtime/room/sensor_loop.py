@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.driver import Observation
-from device_agent.ports.sensor import Camera, SensorError
+from device_agent.ports.sensor import Camera, Reducible, SensorError
 from device_agent.protocol import MAX_VALUES, Measurements, Mode
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
@@ -52,6 +52,7 @@ class SensorLoop:
         check_interlocks: Callable[[float], None],
     ) -> None:
         self._driver = room_device.driver
+        self._reducible = room_device.driver if isinstance(room_device.driver, Reducible) else None
         self._camera = room_device.driver if isinstance(room_device.driver, Camera) else None
         self._room_device = room_device
         self._controller = controller
@@ -97,6 +98,8 @@ class SensorLoop:
                     self._controller.clear_fault(())
                 self._check_interlocks(now_s)
                 self._apply_mode(self._controller.update(now_s).mode)
+                if self._reducible is not None:
+                    self._reducible.reduce(self._room_device.load.share("perception"))
                 for source in self._sources:
                     if source.due_s <= now_s:
                         self._read(source, now_s)

@@ -14,6 +14,7 @@ from device_agent.ports.driver import DriverError, HasCameras
 from device_agent.protocol import Stream
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
+from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.telemetry.periodic_poller import PeriodicPoller
 
 IDLE_PERIOD_S = 1.0
@@ -33,8 +34,10 @@ class CameraStreamer(PeriodicPoller):
         name: str,
         publish: Callable[[str, CameraFrame], None],
         is_controlled: Callable[[], bool],
+        load: LoadGovernor,
     ) -> None:
-        super().__init__(() if driver is None else cameras, self._stream, device=name, kind="camera")
+        sources = () if driver is None else cameras
+        super().__init__(sources, self._stream, device=name, kind="camera", share=lambda: load.share("cameras"))
         self._publish = publish
         self._is_controlled = is_controlled
         self._linked = False

@@ -40,9 +40,12 @@ from device_agent.runtime.control.base_motion import limits_of
 from device_agent.runtime.control.setpoint_stream import MAX_LOOP_AGE_S, WATCHDOG_S
 from device_agent.runtime.storage.journal import Journal
 from device_agent.runtime.telemetry.outbox import Outbox, Publish
+from device_agent.runtime.telemetry.rate_meter import RateMeter
 
 STATE_PERIOD_S = 30.0
 STATE_MIN_GAP_S = 1.0
+LOADED_STATE_PERIOD_S = 5.0
+"""Period while the agent reduces work, for current rates [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,7 @@ class StateSnapshot:
     action: ActionState | None
     restrictions: tuple[Restriction, ...]
     stiffness: Mapping[str, float]
+    load: int = 0
 
     def key(self) -> tuple[object, ...]:
         """The part whose change triggers a new ``state``; progress alone does not."""
@@ -108,6 +112,7 @@ class DevicePublisher:
         self._resend_acks = False
         self._sequences: dict[str, int] = {}
         self._lock = threading.Lock()
+        self._rates = RateMeter()
         self._published_key: tuple[object, ...] = ()
         self._published_s = float("-inf")
         self.rejections: dict[str, int] = {}
@@ -171,7 +176,8 @@ class DevicePublisher:
             self._send_undelivered()
         key = snapshot.key()
         age_s = now_s - self._published_s
-        if age_s < STATE_MIN_GAP_S or (key == self._published_key and age_s < STATE_PERIOD_S):
+        period_s = LOADED_STATE_PERIOD_S if snapshot.load else STATE_PERIOD_S
+        if age_s < STATE_MIN_GAP_S or (key == self._published_key and age_s < period_s):
             return
         at_ms = wall_ms()
         state = State(
@@ -187,6 +193,8 @@ class DevicePublisher:
             faults=snapshot.faults,
             restrictions=snapshot.restrictions,
             stiffness=dict(snapshot.stiffness),
+            load=snapshot.load,
+            rates_hz=dict(self._rates.rates_hz(now_s)),
         )
         if self._retain(self._topic(topics.STATE), state):
             self._published_key, self._published_s = key, now_s
@@ -194,12 +202,15 @@ class DevicePublisher:
     def publish_telemetry(self, stream: str, telemetry: JointTelemetry | Measurements) -> None:
         """Publish a measurement; never blocks, because the control loop calls it."""
         payload = codec.encode(telemetry)
+        now_s = time.monotonic()
+        self._rates.record(f"{topics.TELE}/{stream}", now_s)
         sent = self._publish(self._topic(topics.TELE, stream), payload, qos=0)
         late = self._topic(topics.LATE, stream)
-        self._outbox.add_measurement(late, payload, at_ms=telemetry.at_ms, sent=sent, now_s=time.monotonic())
+        self._outbox.add_measurement(late, payload, at_ms=telemetry.at_ms, sent=sent, now_s=now_s)
 
     def publish_frame(self, camera: str, frame: CameraFrame) -> None:
         """Publish a camera frame; it is dropped if it cannot be sent immediately."""
+        self._rates.record(f"{topics.CAM}/{camera}", time.monotonic())
         self._publish(self._topic(topics.CAM, camera), camera_frames.encode(frame), qos=0)
 
     def publish_event(self, event: EventRecord) -> None:

@@ -25,11 +25,21 @@ class _Schedule:
 class PeriodicPoller:
     """Polls each source at its rate until it is stopped. Missed polls are dropped.
 
-    ``poll`` is called with the name of a source. It may block, and raise ``DriverError``.
+    ``poll`` is called with the name of a source. It may block, and raise ``DriverError``. ``share`` is the share of
+    their rates at which the sources are polled now.
     """
 
-    def __init__(self, sources: Iterable[Stream], poll: Callable[[str], None], *, device: str, kind: str) -> None:
+    def __init__(
+        self,
+        sources: Iterable[Stream],
+        poll: Callable[[str], None],
+        *,
+        device: str,
+        kind: str,
+        share: Callable[[], float],
+    ) -> None:
         self._poll = poll
+        self._share = share
         self._label = f"{device}: {kind}"
         self._schedules = {source.name: _Schedule(1 / source.rate_hz) for source in sources}
         self._stopping = threading.Event()
@@ -52,8 +62,9 @@ class PeriodicPoller:
             now_s = time.monotonic()
             for name, schedule in self._schedules.items():
                 if schedule.due_s <= now_s:
-                    next_s = schedule.due_s + schedule.period_s
-                    schedule.due_s = next_s if next_s > now_s else now_s + schedule.period_s
+                    period_s = schedule.period_s / self._share()
+                    next_s = schedule.due_s + period_s
+                    schedule.due_s = next_s if next_s > now_s else now_s + period_s
                     self._log_change(name, schedule, self._poll_once(name))
             wait_s = max(0.0, min(schedule.due_s for schedule in self._schedules.values()) - time.monotonic())
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.driver import ReportsStreams
 from device_agent.protocol import Measurements, Stream, topics
+from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.readings import Reading, Values
 from device_agent.runtime.telemetry.periodic_poller import PeriodicPoller
 
@@ -25,9 +26,10 @@ class StreamSampler(PeriodicPoller):
         *,
         name: str,
         publish: Callable[[str, Measurements], None],
+        load: LoadGovernor,
     ) -> None:
         polled = [] if driver is None else [stream for stream in streams if stream.name != topics.JOINTS]
-        super().__init__(polled, self._sample, device=name, kind="stream")
+        super().__init__(polled, self._sample, device=name, kind="stream", share=lambda: load.share("telemetry"))
         self._publish = publish
         self._sequences: Counter[str] = Counter()
         self._latest: Mapping[str, tuple[Values, float]] = {}

@@ -136,6 +136,7 @@ class PerceptionDriver:
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._life = threading.Lock()
+        self._share = 1.0
         self._sampled_s = -np.inf
         self._next_s: dict[str, float] = {}
         self._sensor_errors: dict[str, str] = {}
@@ -203,6 +204,10 @@ class PerceptionDriver:
                 self._stopping.set()
                 self._thread.join(timeout=_STOP_TIMEOUT_S)
                 self._thread = None
+
+    def reduce(self, share: float) -> None:
+        """See ``Reducible``."""
+        self._share = share
 
     # ------------------------------------------------------------ for path planning
 
@@ -306,8 +311,12 @@ class PerceptionDriver:
         read = self._neighbours[self._options.light].read("light")
         return {name: float(value) for name, value in read.items() if name == "light_lux"}
 
+    @property
+    def _period_s(self) -> float:
+        """Present time between two samples [s]."""
+        return 1.0 / (self._options.look_hz * self._share)
+
     def _run(self, fusion: SensorFusion) -> None:
-        period_s = 1.0 / self._options.look_hz
         due_s = time.monotonic()
         while not self._stopping.is_set():
             for name in self._sensors:
@@ -315,7 +324,7 @@ class PerceptionDriver:
             now_s = time.monotonic()
             fusion.advance(now_s)
             # Skip missed periods: the next sample is complete.
-            due_s = max(due_s + period_s, now_s)
+            due_s = max(due_s + self._period_s, now_s)
             self._stopping.wait(due_s - now_s)
 
     def _sample(self, fusion: SensorFusion, name: str) -> None:

@@ -35,6 +35,7 @@ from device_agent.protocol import (
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.security import setpoints, signing
 from device_agent.runtime.device import Device
+from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.storage.journal import Journal
 from device_agent.runtime.storage.outbox_store import OutboxStore
@@ -62,6 +63,7 @@ class DeviceHarness:
         speech: Speech | None = None,
         uploads: Uploads | None = None,
     ) -> None:
+        self.load = LoadGovernor()
         self.key = signing.generate()
         self.kind = kind or robot_type()
         self.messages: list[tuple[str, bytes]] = []
@@ -98,6 +100,7 @@ class DeviceHarness:
             owner=OWNER,
             speech=speech,
             uploads=uploads,
+            load=self.load,
         )
 
     def start(self) -> None:

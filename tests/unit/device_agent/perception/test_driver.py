@@ -7,7 +7,7 @@ import time
 import pytest
 
 from device_agent import sensors
-from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
+from device_agent.ports.sensor import Reducible, RoomDriver, SensorError, Surroundings
 from device_agent.protocol import Stream
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.perception import PerceptionDriver, create
@@ -157,6 +157,14 @@ def test_it_fails_only_if_all_sensors_fail(driver, neighbours, monkeypatch):
     assert "the lens is dirty" in until(lambda: positions(driver), lambda result: isinstance(result, str))
     neighbours["lidar"].broken = False
     until(lambda: positions(driver), lambda result: not isinstance(result, str))
+
+
+def test_an_overloaded_agent_samples_the_sensors_less_often(driver):
+    reducible: RoomDriver = driver
+    assert isinstance(reducible, Reducible)
+    usual_s = driver._period_s
+    driver.reduce(0.5)
+    assert driver._period_s == 2 * usual_s
 
 
 @pytest.mark.parametrize(

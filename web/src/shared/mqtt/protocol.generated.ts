@@ -242,6 +242,10 @@ export interface Geometry {
  * ended_epoch: Highest epoch that the device no longer accepts. It only rises, so even an outdated message
  * correctly marks the leases that have ended.
  * stiffness: Joints that hold with reduced strength: joint name → share of the full strength.
+ * load: Which work the agent reduces because its machine is overloaded: 0: none; 1: cameras; 2: also perception;
+ * 3: also telemetry. Control is never reduced.
+ * rates_hz: Measured rate of each stream and camera: `tele/joints`, `cam/front` → messages a second [Hz]. The
+ * configured rates are in `desc`.
  */
 export interface State {
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -257,6 +261,8 @@ export interface State {
   faults?: Fault[];
   restrictions?: Restriction[];
   stiffness?: Record<string, number>;
+  load?: number;
+  rates_hz?: Record<string, number>;
 }
 
 /** What the device is doing now. */

@@ -11,14 +11,18 @@ import pytest
 from device_agent.ports.driver import REST, DriverError, Observation, Twist
 from device_agent.protocol import JointTarget, JointTelemetry, Mode, Setpoint, StopDevice, StopLatch
 from device_agent.protocol.manifests.robot_type import Base
+from device_agent.runtime import load
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control import control_loop as module
+from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.control_loop import ControlLoop
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.control.goals import GoalResult
+from device_agent.runtime.load import LoadGovernor
 from tests.fakes.drivers import BASE, FakeDriver, robot_type
 from tests.harness.agent.controller_fixture import ignore_revocation
 from tests.harness.agent.device_harness import DeviceHarness
+from tests.harness.agent.load import raise_level
 from tests.harness.network.brokers import SILENCE_S, wait_until
 from tests.unit.device_agent.runtime.conftest import MakeDevice
 
@@ -38,6 +42,7 @@ class LoopFixture:
         self.controller.start_at((0.0, 0.0))
         self.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=time.monotonic())
         self.published: list[JointTelemetry] = []
+        self.load = LoadGovernor()
         self.loop = ControlLoop(
             kind,
             self.driver,
@@ -45,6 +50,7 @@ class LoopFixture:
             name="arm",
             publish=self.published.append,
             check_interlocks=lambda _now_s: None,
+            load=self.load,
         )
         self._sequence = 0
 
@@ -315,3 +321,31 @@ def test_a_type_with_a_base_needs_a_mobile_driver() -> None:
     with pytest.raises(DriverError, match="'arm' has a base, but its driver cannot drive"):
         setup.loop.start()
     setup.loop.stop()
+
+
+@pytest.mark.parametrize(("mode", "share"), [(Mode.IDLE, 0.5), (Mode.ACTION, 0.5), (Mode.STREAMING, 1.0)])
+def test_an_overloaded_agent_sends_less_telemetry_except_to_an_operator_who_steers(mode: Mode, share: float) -> None:
+    setup = LoopFixture()
+    output = ControlOutput([0.0, 0.0], mode, 1, 0, 0.0, 0.0, ())
+
+    def messages(start_s: float) -> int:
+        return sum(setup.loop._is_due(start_s + number * 0.01, output) for number in range(400))
+
+    usual = messages(1000.0)
+    raise_level(setup.load, 3)
+    assert messages(2000.0) == pytest.approx(usual * share, abs=2)
+
+
+def test_a_late_period_raises_the_load_level_and_still_commands(
+    make_loop: MakeLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driver = InlineDriver()
+    setup = make_loop(driver)
+    monkeypatch.setattr(load, "WINDOW_S", 0.0)
+    monkeypatch.setattr(load, "MIN_PERIODS", 1)
+    commanded = len(driver.threads)
+    with setup.loop._period_lock:
+        setup.loop._next_s = time.monotonic() - 2 * LONG_MS / 1000
+        setup.loop._run_period(early=False)
+        assert setup.load.level == 1
+    assert len(driver.threads) == commanded + 1

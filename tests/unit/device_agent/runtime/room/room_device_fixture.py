@@ -41,6 +41,7 @@ class FakeSensor:
         self.closed = False
         self.picture = JPEG
         self.values: dict[str, float | bool] = {}
+        self.share = 1.0
 
     def connect(self) -> None:
         self._check()
@@ -69,6 +70,9 @@ class FakeSensor:
 
     def raw(self) -> None:
         return None
+
+    def reduce(self, share: float) -> None:
+        self.share = share
 
     def close(self) -> None:
         self.closed = True

@@ -3,11 +3,16 @@
 import math
 from unittest import mock
 
+import pytest
+
 from device_agent.ports.sensor import RoomDriver
 from device_agent.protocol import Control, Description, camera_frames, topics
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.room.room_device import RoomDevice
-from tests.harness.agent.device_harness import eventually
+from device_agent.runtime.telemetry import device_publisher, rate_meter
+from tests.harness.agent.device_harness import eventually, wait_for_state
+from tests.harness.agent.load import raise_level
+from tests.unit.device_agent.runtime.room.conftest import MakeRoomDevice
 from tests.unit.device_agent.runtime.room.room_device_fixture import ENTRY, JPEG, RoomDeviceHarness, await_growth
 
 
@@ -67,3 +72,26 @@ def test_hold_and_cameras_are_optional() -> None:
     room_device.hold()
     assert room_device.cameras == ()
     assert not room_device.simulated
+
+
+def test_an_overloaded_agent_reads_cameras_first_and_streams_last_less_often(harness: RoomDeviceHarness) -> None:
+    device = harness.room_device
+    assert (device.rate_hz("garden"), device.rate_hz("air")) == (20.0, 20.0)
+    raise_level(harness.load, 1)
+    assert (device.rate_hz("garden"), device.rate_hz("air")) == (5.0, 20.0)
+    raise_level(harness.load, 2)
+    eventually(lambda: harness.sensor.share == 0.5)
+    raise_level(harness.load, 3)
+    assert device.rate_hz("air") == 10.0
+
+
+def test_the_state_has_the_load_level_and_the_measured_rates(
+    make_room_device: MakeRoomDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rate_meter, "WINDOW_S", 0.3)
+    monkeypatch.setattr(device_publisher, "LOADED_STATE_PERIOD_S", 0.05)
+    harness = make_room_device()
+    await_growth(harness.measured)
+    raise_level(harness.load, 1)
+    state = wait_for_state(harness, lambda state: state.load == 1 and {"tele/air", "cam/garden"} <= set(state.rates_hz))
+    assert state.rates_hz["tele/air"] > 0

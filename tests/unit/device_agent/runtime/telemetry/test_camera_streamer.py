@@ -9,9 +9,11 @@ from device_agent.ports.sensor import Frame
 from device_agent.protocol import Description, Stream, camera_frames, topics
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
+from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.telemetry.camera_streamer import LINGER_S, CameraStreamer
 from tests.fakes.drivers import FakeDriver, robot_type
 from tests.harness.agent.device_harness import eventually
+from tests.harness.agent.load import raise_level
 from tests.unit.device_agent.runtime.conftest import MakeDevice
 from tests.unit.device_agent.runtime.telemetry.conftest import PollClock
 
@@ -40,8 +42,9 @@ class StreamerFixture:
     def __init__(self, driver: CameraDriver | None) -> None:
         self.frames: list[CameraFrame] = []
         self.controlled = True
+        self.load = LoadGovernor()
         self.streamer = CameraStreamer(
-            [EYES], driver, name="cart", publish=self.publish, is_controlled=lambda: self.controlled
+            [EYES], driver, name="cart", publish=self.publish, is_controlled=lambda: self.controlled, load=self.load
         )
         self.streamer.link_changed(True)
 
@@ -118,3 +121,12 @@ def test_frames_are_live_with_a_link_during_control_and_for_a_while_after(clock:
     fixture.streamer.link_changed(False)
     assert frames_in(10.0) == 0
     assert driver.reads == len(fixture.frames)
+
+
+def test_an_overloaded_agent_sends_a_quarter_of_the_frames(clock: PollClock) -> None:
+    fixture = StreamerFixture(CameraDriver())
+    clock.run(fixture.streamer, 4.0)
+    usual = len(fixture.frames)
+    raise_level(fixture.load, 1)
+    clock.run(fixture.streamer, 4.0)
+    assert len(fixture.frames) - usual == pytest.approx(usual / 4, abs=1)

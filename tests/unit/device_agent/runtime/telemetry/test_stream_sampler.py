@@ -8,9 +8,11 @@ import pytest
 from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import Measurements, Stream, topics
+from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.telemetry.stream_sampler import StreamSampler
 from tests.fakes.drivers import FakeDriver, robot_type
 from tests.harness.agent.device_harness import eventually
+from tests.harness.agent.load import raise_level
 from tests.unit.device_agent.runtime.actions.robot_api_fixture import play
 from tests.unit.device_agent.runtime.conftest import MakeDevice
 from tests.unit.device_agent.runtime.telemetry.conftest import PollClock
@@ -35,8 +37,13 @@ class StreamDriver(FakeDriver):
 class SamplerFixture:
     def __init__(self, driver: StreamDriver | None, *streams: Stream) -> None:
         self.published: dict[str, list[Measurements]] = {stream.name: [] for stream in streams}
+        self.load = LoadGovernor()
         self.sampler = StreamSampler(
-            streams, driver, name="cart", publish=lambda name, measured: self.published[name].append(measured)
+            streams,
+            driver,
+            name="cart",
+            publish=lambda name, measured: self.published[name].append(measured),
+            load=self.load,
         )
 
 
@@ -115,3 +122,15 @@ def test_an_interlock_can_use_the_robots_own_stream(make_device: MakeDevice) -> 
     driver.reports["sonar"] = lambda: {"distance_m": 0.2}
     (restriction,) = eventually(lambda: harness.device._controller.restrictions)
     assert "distance_m" in restriction.why
+
+
+@pytest.mark.parametrize(("level", "share"), [(2, 1.0), (3, 0.5)])
+def test_an_overloaded_agent_samples_streams_less_often_at_the_last_level(
+    clock: PollClock, level: int, share: float
+) -> None:
+    fixture = SamplerFixture(StreamDriver(sonar=lambda: {"distance_m.left": 0.8}), SONAR)
+    clock.run(fixture.sampler, 4.0)
+    usual = len(fixture.published["sonar"])
+    raise_level(fixture.load, level)
+    clock.run(fixture.sampler, 4.0)
+    assert len(fixture.published["sonar"]) - usual == pytest.approx(usual * share, abs=1)
