@@ -2,7 +2,7 @@ import type { Account } from "../../shared/api/types";
 import { ActionCards, RunStatusPanel } from "../../features/actions";
 import { ControlBar, StopBanner, useDeviceSessions } from "../../features/control";
 import type { DeviceSession } from "../../features/control/model";
-import { deviceTexts as texts, EventLog, LastSeenAge, ReachChip, RenameDevice } from "../../features/devices";
+import { deviceTexts as texts, EventLog, LastSeenAge, RateNotice, ReachChip, RenameDevice } from "../../features/devices";
 import type { DeviceStore, Fleet } from "../../features/devices/model";
 import { HealthChip } from "../../features/health";
 import { PageExplainer } from "../../features/help";
@@ -81,6 +81,7 @@ function Operate({ api, fleet, device, account }: OperateProps) {
       <main class="page operate" id="content">
         <Heading api={api} device={device} fleet={fleet} />
         <StopBanner device={device} stop={stop} />
+        <RateNotice device={device} />
         <PageExplainer page={robot ? "device" : "roomDevice"} />
         {robot && <RunStatusPanel device={device} control={control} actions={session.actions} />}
         {robot ? (

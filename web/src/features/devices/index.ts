@@ -1,6 +1,7 @@
 export { actionUnavailableReason, unavailableReason } from "./availability";
 export { DeviceLists, faultsOf } from "./device-list";
 export { EventLog } from "./event-log";
+export { RateNotice } from "./rate-notice";
 export { LastSeenAge, ReachChip } from "./reach-chip";
 export { RenameDevice } from "./rename";
 export { OperateSelected } from "./selection";

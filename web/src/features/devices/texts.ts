@@ -54,6 +54,8 @@ export const texts = {
     accessLostReason:
       "The owner revoked your access, it expired, or the device was unpaired. Your control and actions ended immediately. Ask the owner if you need access again.",
     simulated: "simulated",
+    overloaded: (rates: string): string => `The device's computer is overloaded. Reduced rates: ${rates}. Control is not affected.`,
+    rate: (name: string, measured: string, configured: string): string => `${name} ${measured} of ${configured} Hz`,
     unreadable: (detail: string): string => `A message of this device is invalid: ${detail}.`,
     lastSeen: (age: string): string => `last seen ${age}`,
   },

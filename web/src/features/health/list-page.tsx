@@ -21,6 +21,7 @@ import { healthAddress, healthAddressOf, spaceAddress } from "../../shared/routi
 import "./health.css";
 
 const EVERY_MS = 10_000;
+const SERVER_EVERY_MS = 60_000;
 
 interface HealthPageProps {
   api: Api;
@@ -52,6 +53,8 @@ type HealthFilter = "all" | "attention";
 
 function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: string }) {
   const { value, error, refresh } = usePolling(() => api.health.all(space === "" ? null : space), EVERY_MS, [api, space]);
+  const server = usePolling(() => api.health.server(), SERVER_EVERY_MS, [api]);
+  const problems = [server.value?.broker, server.value?.models].filter((part) => part !== undefined && part !== "ok");
   const [filter, setFilter] = useState<HealthFilter>("all");
   const devices = fleet.devices.value;
   const reported = useComputed(() =>
@@ -84,6 +87,11 @@ function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: stri
         ))}
       </nav>
       {error !== "" && <p class="notice bad">{texts.health.failed(error)}</p>}
+      {problems.map((reason) => (
+        <p key={reason} class="notice bad" data-testid="server-problem">
+          {texts.health.server(reason ?? "")}
+        </p>
+      ))}
       {value === null && error === "" && <p class="quiet">{common.loading}</p>}
       {value !== null && (
         <div class="row health-summary">

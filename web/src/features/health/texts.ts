@@ -22,6 +22,7 @@ export const texts = {
     noFault: { ok: "No faults.", unknown: "No data received, so the health is unknown." },
     since: (when: string): string => `since ${when}`,
     failed: (reason: string): string => `Health data failed to load: ${reason}`,
+    server: (reason: string): string => `The server is not fully available: ${reason}`,
     faults: "Faults",
     whichFaults: "Show faults",
     faultLists: { open: "Open", past: "Past" },

@@ -117,7 +117,7 @@ export function CameraCard({ device, name, roomAction, title, aside }: CameraCar
             {roomAction.busy.value === "capture" ? texts.camera.taking : texts.camera.shot}
           </button>
         )}
-        <span class="quiet small">{shown !== null && <Caption shown={shown} running={running} rate={rate} />}</span>
+        <span class="quiet small">{shown !== null && <Caption shown={shown} running={running} rate={rate} rateHz={rateHz} />}</span>
       </div>
       {roomAction !== null && roomAction.error.value !== "" && <p class="notice bad">{roomAction.error.value}</p>}
       {error !== "" && <p class="notice bad">{error}</p>}
@@ -125,11 +125,20 @@ export function CameraCard({ device, name, roomAction, title, aside }: CameraCar
   );
 }
 
-function Caption({ shown, running, rate }: { shown: Shown; running: boolean; rate: number }) {
+interface CaptionProps {
+  shown: Shown;
+  running: boolean;
+  /** Measured rate [Hz]. */
+  rate: number;
+  /** Configured rate [Hz]. */
+  rateHz: number;
+}
+
+function Caption({ shown, running, rate, rateHz }: CaptionProps) {
   const { kind, width, height, at } = shown;
   if (kind === "still") return <Age at={at} as={(age) => texts.camera.still(width, height, age)} />;
   if (!running) return <Age at={at} as={texts.camera.stopped} />;
-  return <>{texts.camera.live(width, height, format.oneDigit(rate))}</>;
+  return <>{texts.camera.live(width, height, format.oneDigit(rate), format.upToOneDigit(rateHz))}</>;
 }
 
 /** Decodes one frame at a time and drops frames that arrive meanwhile, so that the newest is drawn. */

@@ -44,7 +44,8 @@ export const texts = {
     waiting: "Waiting for the first image…",
     stalled: (age: string): string => `Last image received ${age}`,
     label: (name: string): string => `Image of the camera ${name}`,
-    live: (width: number, height: number, rate: string): string => `Live, ${width} × ${height}, ${rate} frames per second`,
+    live: (width: number, height: number, rate: string, configured: string): string =>
+      `Live, ${width} × ${height}, ${rate} of ${configured} Hz`,
     still: (width: number, height: number, age: string): string => `Still image, ${width} × ${height}, captured ${age}`,
     stopped: (age: string): string => `Stopped. Last image received ${age}.`,
     undecodable: "This browser cannot display an image that was received.",

@@ -93,6 +93,12 @@ export interface StoredStream {
   fields: string[];
 }
 
+/** Each part is `ok`, or a description of its error. */
+export interface ServerHealth {
+  broker: string;
+  models: string;
+}
+
 export const RANK: Readonly<Record<HealthState, number>> = { ok: 0, unknown: 1, warning: 2, fault: 3 };
 
 /** All methods throw only `ApiError`. */
@@ -107,6 +113,10 @@ export class HealthApi {
   async all(space: string | null): Promise<HealthSummary[]> {
     const lines = await this.#http.all<HealthSummary>(space === null ? "/diagnostics" : `/spaces/${space}/diagnostics`);
     return lines.sort((one, other) => RANK[other.health] - RANK[one.health] || one.label.localeCompare(other.label));
+  }
+
+  server(): Promise<ServerHealth> {
+    return this.#http.call("GET", "/health");
   }
 
   of(device: string): Promise<DeviceHealth> {

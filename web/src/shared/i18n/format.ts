@@ -11,6 +11,7 @@ function oneDigit(value: number): string {
 
 export const format = {
   oneDigit,
+  upToOneDigit: (value: number): string => String(Math.round(value * 10) / 10),
   degrees: (deg: number): string => `${oneDigit(deg)}°`,
   radiansAsDegrees: (rad: number): string => `${oneDigit((rad * 180) / Math.PI)}°`,
   wholeDegrees: (deg: number): string => `${Math.round(deg)}°`,

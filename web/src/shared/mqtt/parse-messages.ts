@@ -161,6 +161,8 @@ const state = object<Required<State>>({
   faults: optional(list(object<Fault>({ code: text, message: text, since_ms: count }), MAX_JOINTS), []),
   restrictions: optional(list(object<Restriction>({ source: text, speed: number, reason: text }), MAX_JOINTS), []),
   stiffness: optional(byName, {}),
+  load: optional(count, 0),
+  rates_hz: optional(byName, {}),
 });
 
 const measured = list(number, MAX_JOINTS);
