@@ -41,7 +41,6 @@ class FakeSensor:
         self.closed = False
         self.picture = JPEG
         self.values: dict[str, float | bool] = {}
-        self.share = 1.0
 
     def connect(self) -> None:
         self._check()
@@ -71,15 +70,21 @@ class FakeSensor:
     def raw(self) -> None:
         return None
 
-    def reduce(self, share: float) -> None:
-        self.share = share
-
     def close(self) -> None:
         self.closed = True
 
     def _check(self) -> None:
         if self.broken:
             raise SensorError(self.broken)
+
+
+class ReducibleSensor(FakeSensor):
+    """A sensor with work of its own."""
+
+    share = 1.0
+
+    def reduce(self, share: float) -> None:
+        self.share = share
 
 
 class FakeUploads:
@@ -105,8 +110,9 @@ class RoomDeviceHarness(DeviceHarness):
         uploads: bool = True,
         interlocks: Sequence[InterlockRule] = (),
         broken: str = "",
+        sensor: FakeSensor | None = None,
     ) -> None:
-        self.sensor, self.uploads = FakeSensor(), FakeUploads()
+        self.sensor, self.uploads = sensor or FakeSensor(), FakeUploads()
         self.sensor.broken = broken
         self.room_device = RoomDevice(self.sensor, entry, self.uploads if uploads else None)
         driver: Any = self.room_device

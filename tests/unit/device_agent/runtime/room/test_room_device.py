@@ -13,7 +13,13 @@ from device_agent.runtime.telemetry import device_publisher, rate_meter
 from tests.harness.agent.device_harness import eventually, wait_for_state
 from tests.harness.agent.load import raise_level
 from tests.unit.device_agent.runtime.room.conftest import MakeRoomDevice
-from tests.unit.device_agent.runtime.room.room_device_fixture import ENTRY, JPEG, RoomDeviceHarness, await_growth
+from tests.unit.device_agent.runtime.room.room_device_fixture import (
+    ENTRY,
+    JPEG,
+    ReducibleSensor,
+    RoomDeviceHarness,
+    await_growth,
+)
 
 
 def test_description_lists_streams_and_actions(harness: RoomDeviceHarness) -> None:
@@ -74,13 +80,15 @@ def test_hold_and_cameras_are_optional() -> None:
     assert not room_device.simulated
 
 
-def test_an_overloaded_agent_reads_cameras_first_and_streams_last_less_often(harness: RoomDeviceHarness) -> None:
+def test_an_overloaded_agent_reads_cameras_first_and_streams_last_less_often(make_room_device: MakeRoomDevice) -> None:
+    sensor = ReducibleSensor()
+    harness = make_room_device(sensor=sensor)
     device = harness.room_device
     assert (device.rate_hz("garden"), device.rate_hz("air")) == (20.0, 20.0)
     raise_level(harness.load, 1)
     assert (device.rate_hz("garden"), device.rate_hz("air")) == (5.0, 20.0)
     raise_level(harness.load, 2)
-    eventually(lambda: harness.sensor.share == 0.5)
+    eventually(lambda: sensor.share == 0.5)
     raise_level(harness.load, 3)
     assert device.rate_hz("air") == 10.0
 
