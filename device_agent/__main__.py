@@ -12,11 +12,11 @@ from device_agent.config.errors import ConfigError
 from device_agent.load_generator.options import LoadTestError
 from device_agent.ports.driver import DriverError
 from device_agent.ports.transport import TransportError
+from device_agent.protocol.security import private_folder
 from device_agent.runtime.storage.journal import JournalError
 from device_agent.transports.http.client import CloudError
 
 _COMMANDS = (enroll, run, doctor, devices, models, load_test)
-_PRIVATE_UMASK = 0o077
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -25,8 +25,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code.
     """
+    os.umask(private_folder.UMASK)
     options = _parser().parse_args(arguments)
-    os.umask(_PRIVATE_UMASK)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     try:
         code: int = options.command(options)

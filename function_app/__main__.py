@@ -2,9 +2,11 @@
 
 import argparse
 import logging
+import os
 import sys
 from collections.abc import Sequence
 
+from device_agent.protocol.security import private_folder
 from function_app.entrypoints.cli import accounts, audit, keys, server
 from function_app.entrypoints.hosts.uvicorn import PortTaken
 from function_app.ports.model_compiler import CompilerMissingError
@@ -22,6 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for module in (server, keys, accounts, audit):
         module.add_commands(commands)
+    os.umask(private_folder.UMASK)
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     for sdk in ("azure", "botocore"):  # they log every request

@@ -31,7 +31,7 @@ from device_agent.config.errors import ConfigError
 from device_agent.protocol import Id
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.fields import Milliseconds
-from device_agent.protocol.security import signing
+from device_agent.protocol.security import private_folder, signing
 from device_agent.protocol.security.key_rotation import Serial
 
 SERVER_CA = "server-ca.pem"
@@ -157,6 +157,8 @@ class IdentityStore:
     def lock(self) -> Iterator[None]:
         """Hold the exclusive right to run this agent until the end of the ``with`` block or of the process.
 
+        Removes the access of other users to the folder.
+
         An SQLite lock behaves the same on every operating system and is released when its process ends.
 
         Raises:
@@ -175,6 +177,7 @@ class IdentityStore:
                         f"another process already runs the agent of {self.folder}; stop it first"
                     ) from error
                 raise ConfigError(f"{path} cannot be written: {error}") from error
+            private_folder.restrict(self.folder, advice="delete identity.pem and enroll again")
             yield
 
 

@@ -7,6 +7,7 @@ invalid file or argument; errors print one line with advice.
 import argparse
 import asyncio
 import logging
+import os
 import signal
 import socket
 import ssl
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import function_app
+from device_agent.protocol.security import private_folder
 from function_app.entrypoints.hosts.connection_limits import raise_descriptor_limit
 from infra.embedded_broker.broker import TCP, WEBSOCKET, TelescopeBroker
 from infra.embedded_broker.limits import Limits
@@ -29,6 +31,7 @@ BAD_INPUT, PORT_TAKEN = 2, 3
 
 def main() -> int:
     """Run the broker; returns the exit code."""
+    os.umask(private_folder.UMASK)
     arguments = _arguments()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     log.addFilter(RepeatFilter())

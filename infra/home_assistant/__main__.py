@@ -20,6 +20,7 @@ import paho.mqtt.client as mqtt
 import requests
 from paho.mqtt.enums import CallbackAPIVersion
 
+from device_agent.protocol.security import private_folder
 from device_agent.transports import tls as trust
 from infra import programs
 from infra.home_assistant import discovery
@@ -97,6 +98,7 @@ class Telescope:
 
 def main() -> int:
     """Run the bridge; returns the exit code."""
+    os.umask(private_folder.UMASK)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     arguments = _arguments()
     key = os.environ.get("TELESCOPE_KEY", "").strip()

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from device_agent.protocol.security import private_folder
 from infra.local import settings
 from infra.local.supervisor import StartError, SupervisedProcess
 
@@ -268,6 +269,7 @@ def log_progress(text: str) -> None:
 
 def main() -> int:
     """Start, run until SIGINT or SIGTERM, stop; returns the exit code."""
+    os.umask(private_folder.UMASK)
     stopping = threading.Event()
 
     def request_stop(_number: int, _frame: FrameType | None) -> None:

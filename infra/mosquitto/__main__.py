@@ -5,9 +5,11 @@ is in use or mosquitto is not installed; 2 if the folder cannot be used; 1 if mo
 """
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
+from device_agent.protocol.security import private_folder
 from infra import programs
 from infra.mosquitto import configuration
 from infra.mosquitto.configuration import Tls
@@ -15,6 +17,7 @@ from infra.mosquitto.configuration import Tls
 
 def main() -> int:
     """Run mosquitto; returns the exit code."""
+    os.umask(private_folder.UMASK)
     arguments = _arguments()
     home = arguments.home
     try:

@@ -5,15 +5,18 @@ not installed; 2 if an argument or the folder is invalid; 1 if Prosody exits. Er
 """
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
+from device_agent.protocol.security import private_folder
 from infra import programs
 from infra.prosody import configuration
 
 
 def main() -> int:
     """Run Prosody; returns the exit code."""
+    os.umask(private_folder.UMASK)
     arguments = _arguments()
     try:
         host = programs.address(arguments.host)

@@ -2,9 +2,11 @@
 
 import argparse
 import datetime as dt
+import os
 import sys
 from pathlib import Path
 
+from device_agent.protocol.security import private_folder
 from infra.tls import agent_ca, server_ca
 from infra.tls.server_ca import TlsError
 
@@ -13,6 +15,7 @@ _BAD_INPUT = 2
 
 def main() -> int:
     """Run the command; returns the exit code."""
+    os.umask(private_folder.UMASK)
     options = _arguments()
     now = dt.datetime.now(dt.UTC)
     try:

@@ -4,7 +4,6 @@ import os
 import platform
 import shutil
 import sqlite3
-import stat
 import sys
 from collections.abc import Iterator
 from contextlib import closing
@@ -12,6 +11,7 @@ from pathlib import Path
 
 from device_agent.cli.doctor.finding import Finding, ok, problem, warning
 from device_agent.config.identity_store import IdentityStore
+from device_agent.protocol.security import private_folder
 from device_agent.sandbox.host import SandboxHost
 from device_agent.speech.espeak import PROGRAM
 
@@ -60,27 +60,21 @@ def folder(store: IdentityStore) -> Iterator[Finding]:
     if not (path / "identity.pem").exists():
         yield problem("folder", f"{path} holds no agent", "Run `python -m device_agent enroll` first.")
         return
-    if sys.platform != "win32":
-        findings = list(_readable_by_others(path))
-        yield from findings
-        if findings:
-            return
+    findings = list(_readable_by_others(path))
+    yield from findings
+    if findings:
+        return
     yield ok("folder", f"{path} is accessible to this user only")
 
 
 def _readable_by_others(path: Path) -> Iterator[Finding]:
-    for entry in (path, *sorted(path.iterdir())):
-        if entry != path and not entry.is_file():
-            continue
-        if stat.S_IMODE(entry.stat().st_mode) & 0o077:
-            mode = "700" if entry == path else "600"
-            if entry.name in _SECRET:
-                message = f"other users of this machine can read {entry} and impersonate this agent"
-                yield problem(
-                    "folder", message, f"chmod {mode} {entry}; if others use this machine, delete it and enroll."
-                )
-            else:
-                yield warning("folder", f"other users of this machine can read {entry}", f"chmod {mode} {entry}")
+    for entry in private_folder.exposed(path):
+        mode = "700" if entry.is_dir() else "600"
+        if entry.name in _SECRET:
+            message = f"other users of this machine can read {entry} and impersonate this agent"
+            yield problem("folder", message, f"chmod {mode} {entry}; if others use this machine, delete it and enroll.")
+        else:
+            yield warning("folder", f"other users of this machine can read {entry}", f"chmod {mode} {entry}")
 
 
 def disk(store: IdentityStore) -> Iterator[Finding]:

@@ -5,10 +5,10 @@ import asyncio
 import os
 from typing import Any
 
-from function_app import bootstrap, settings
+from function_app import settings
 from function_app.adapters import factory
 from function_app.bootstrap import Functions
-from function_app.entrypoints.cli import with_functions
+from function_app.entrypoints.cli import build, with_functions
 from function_app.entrypoints.hosts import uvicorn, worker
 from function_app.settings import SettingsError
 
@@ -32,7 +32,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _serve(_: argparse.Namespace) -> int:
-    functions = bootstrap.build(settings.read())
+    functions = build()
     asyncio.run(_check(functions))
     uvicorn.serve(functions)
     return 0

@@ -1,5 +1,10 @@
+import contextlib
+import importlib
+import os
 import subprocess
 import sys
+
+import pytest
 
 from tests.harness.paths import ROOT
 
@@ -28,3 +33,19 @@ def test_a_server_that_ignores_sigterm_is_killed() -> None:
             assert process.wait(60.0) == 0
         finally:
             process.kill()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "device_agent",
+        "function_app",
+        *(f"infra.{name}" for name in ("embedded_broker", "home_assistant", "local", "mosquitto", "prosody", "tls")),
+    ],
+)
+def test_programs_create_private_files(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    monkeypatch.setenv("TELESCOPE_PORT", "invalid")  # infra.local has no arguments
+    with contextlib.suppress(SystemExit):
+        importlib.import_module(f"{name}.__main__").main()
+    assert os.umask(0o022) == 0o077
