@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
 
@@ -85,12 +85,21 @@ def explain(error: Exception, *, server: str, host: str, home: Path) -> int:
             text, code = f"cannot use {error.filename or home}: {error.strerror}", BAD_INPUT
         case _:
             text, code = str(error), BAD_INPUT
-    _print_error(text)
+    print_error(text)
     return code
 
 
 def supervise(
-    name: str, command: Sequence[str], *, host: str, ports: Sequence[int], ready: str, watched: Path | None = None
+    name: str,
+    command: Sequence[str],
+    *,
+    host: str,
+    ports: Sequence[int],
+    ready: str,
+    watched: Path | None = None,
+    refresh: Callable[[], None] = lambda: None,
+    folder: Path | None = None,
+    user: tuple[int, int] | None = None,
 ) -> int:
     """Run a server until SIGTERM or SIGINT; print ``ready`` once it accepts connections on every port.
 
@@ -101,6 +110,9 @@ def supervise(
         ports: Its ports.
         ready: The line to print.
         watched: A file of the server; a change sends SIGHUP to the server.
+        refresh: Called before that; an ``OSError`` is printed.
+        folder: Its working directory. The server needs no access to the folders above.
+        user: User id and group id of the server; ``None`` for those of this program.
 
     Returns:
         The exit code.
@@ -118,6 +130,10 @@ def supervise(
         signal.signal(number, stop)
     child = subprocess.Popen(  # noqa: S603 (resolved path, generated files)
         command,
+        cwd=folder,
+        user=user and user[0],
+        group=user and user[1],
+        extra_groups=user and [],
         stdin=subprocess.DEVNULL,
         stdout=sys.stderr.fileno(),  # standard output is reserved for the ready line
         preexec_fn=lambda: signal_with_parent(signal.SIGKILL),  # noqa: PLW1509 (single-threaded)
@@ -136,11 +152,20 @@ def supervise(
         if time.monotonic() > kill_at:
             child.kill()
         elif stamp != previous:
-            child.send_signal(signal.SIGHUP)
+            _reload(child, refresh)
     if kill_at < math.inf:
         return 0
-    _print_error(f"{name} exited with code {child.returncode}; see its output above")
+    print_error(f"{name} exited with code {child.returncode}; see its output above")
     return ENDED
+
+
+def _reload(child: "subprocess.Popen[bytes]", refresh: Callable[[], None]) -> None:
+    try:
+        refresh()
+    except OSError as error:
+        print_error(f"cannot read {error.filename}: {error.strerror}; the previous content applies")
+    else:
+        child.send_signal(signal.SIGHUP)
 
 
 def _stamp(path: Path | None) -> tuple[int, int] | None:
@@ -162,14 +187,15 @@ def _wait_for_ports(name: str, child: "subprocess.Popen[bytes]", host: str, port
             del pending[0]
         except OSError:
             if time.monotonic() > deadline:
-                _print_error(f"{name} does not listen on {host}:{pending[0]}")
+                print_error(f"{name} does not listen on {host}:{pending[0]}")
                 child.terminate()
                 return False
             time.sleep(0.02)
     return not pending
 
 
-def _print_error(text: str) -> None:
+def print_error(text: str) -> None:
+    """Print one line about a failure of the server."""
     print(f"broker: {text}", file=sys.stderr)  # noqa: T201 (command-line program)
 
 

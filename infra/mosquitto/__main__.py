@@ -6,38 +6,66 @@ is in use or mosquitto is not installed; 2 if the folder cannot be used; 1 if mo
 
 import argparse
 import os
+import resource
 import sys
 from pathlib import Path
 
 from device_agent.protocol.security import private_folder
 from infra import programs
-from infra.mosquitto import configuration
+from infra.mosquitto import broker_user, configuration
 from infra.mosquitto.configuration import Tls
+
+_LISTENERS = 2
+_OTHER_FILES = 64
+"""Open files of mosquitto besides connections, with a reserve."""
+_MAX_CONNECTIONS = 10_000
 
 
 def main() -> int:
     """Run mosquitto; returns the exit code."""
     os.umask(private_folder.UMASK)
     arguments = _arguments()
-    home = arguments.home
+    home, user, tls = arguments.home, broker_user.choose(), _tls(arguments)
     try:
         # On IPv6 mosquitto's WebSocket listener cannot be bound to one address.
         host = programs.address(arguments.host)
         binary, plugin = configuration.binary(), configuration.plugin()
         tcp_port, websocket_port = programs.free_ports(host, arguments.tcp_port, arguments.websocket_port)
         configuration.write(
-            home, host=host, tcp_port=tcp_port, websocket_port=websocket_port, plugin_path=plugin, tls=_tls(arguments)
+            home,
+            host=host,
+            tcp_port=tcp_port,
+            websocket_port=websocket_port,
+            plugin_path=plugin,
+            tls=tls,
+            max_connections=_allow_connections(arguments.max_connections),
+            user=user,
         )
     except (programs.NotInstalledError, programs.PortTakenError, OSError) as error:
         return programs.explain(error, server="mosquitto", host=arguments.host, home=home)
+    if user.notice:
+        programs.print_error(user.notice)
     return programs.supervise(
         "mosquitto",
-        [binary, "-c", str(home / configuration.CONFIGURATION_FILE)],
+        [binary, "-c", configuration.CONFIGURATION_FILE],
         host=host,
         ports=(tcp_port, websocket_port),
         ready=f"ready tcp={tcp_port} websocket={websocket_port}",
         watched=arguments.revoked,
+        refresh=lambda: configuration.copy_certificates(home, tls, user),
+        folder=home,
+        user=(user.uid, user.gid) if user.differs else None,
     )
+
+
+def _allow_connections(requested: int) -> int:
+    """Allow the open files for this number of connections of each listener; returns the number that is possible."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    files = _LISTENERS * requested + _OTHER_FILES
+    if hard != resource.RLIM_INFINITY:
+        files = min(files, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
+    return max(1, (files - _OTHER_FILES) // _LISTENERS)
 
 
 def _tls(arguments: argparse.Namespace) -> Tls | None:
@@ -55,12 +83,20 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--certificate", type=Path, help="use TLS only, with this certificate and its chain (PEM)")
     parser.add_argument("--certificate-key", type=Path, help="its key (PEM)")
     parser.add_argument("--agents-ca", type=Path, help="require client certificates of this CA on TCP (PEM)")
+    parser.add_argument(
+        "--max-connections",
+        type=int,
+        default=_MAX_CONNECTIONS,
+        help="connections of each listener; limited by the open files that the system allows (default: %(default)s)",
+    )
     parser.add_argument("--revoked", type=Path, help="revoked client certificates (CRL, PEM); reloaded on change")
     arguments = parser.parse_args()
     if (arguments.agents_ca and not arguments.certificate) or (arguments.revoked and not arguments.agents_ca):
         parser.error("--agents-ca needs --certificate, --revoked needs --agents-ca")
     if bool(arguments.certificate) != bool(arguments.certificate_key):
         parser.error("--certificate and --certificate-key must be given together")
+    if arguments.max_connections < 1:
+        parser.error("--max-connections must be 1 or more")
     return arguments
 
 

@@ -7,22 +7,30 @@ import base64
 import errno
 import hashlib
 import json
-import os
-import pwd
 import secrets
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from device_agent.protocol import codec
 from device_agent.protocol.security import grants, revocation
+from function_app.adapters.local import mosquitto_clients
 from infra import files, programs
+from infra.mosquitto.broker_user import BrokerUser
 
 SERVICE = "service"
 """User name and role of the functions' client."""
 CONFIGURATION_FILE = "mosquitto.conf"
 SECURITY_FILE = "dynamic-security.json"
 PASSWORD_FILE = "service.password"  # noqa: S105 (the name of a file)
+CERTIFICATE_FILE, KEY_FILE, AGENTS_CA_FILE, REVOKED_FILE = (
+    "listener.crt",
+    "listener.key",
+    "agents-ca.crt",
+    "agents.crl",
+)
+"""Copies of the TLS files: the user of the broker cannot read the originals."""
 PACKAGE = "mosquitto"
 """Debian package of the broker and the plugin."""
 
@@ -83,16 +91,23 @@ class Tls(NamedTuple):
 
 
 def write(
-    home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_path: str, tls: Tls | None = None
+    home: Path,
+    *,
+    host: str,
+    tcp_port: int,
+    websocket_port: int,
+    plugin_path: str,
+    max_connections: int,
+    user: BrokerUser,
+    tls: Tls | None = None,
 ) -> None:
-    """Create missing files and update the configuration.
+    """Create missing files and update the configuration. The broker's user gets all files but the service password.
 
     Raises:
         OSError: ``home`` cannot be written, or a certificate cannot be read.
     """
-    for path in [path for path in tls or () if path is not None]:
-        path.read_bytes()  # the broker only reports an OpenSSL error
     home.mkdir(parents=True, exist_ok=True, mode=0o700)
+    copy_certificates(home, tls, user)
     security = home / SECURITY_FILE
     if not security.exists():
         password = secrets.token_urlsafe(32)
@@ -105,31 +120,48 @@ def write(
             str(home / PASSWORD_FILE),
         )
     else:
-        _update_rights(security)
+        _update_security(security)
     text = configuration(
-        home, host=host, tcp_port=tcp_port, websocket_port=websocket_port, plugin_path=plugin_path, tls=tls
+        host=host,
+        tcp_port=tcp_port,
+        websocket_port=websocket_port,
+        plugin_path=plugin_path,
+        max_connections=max_connections,
+        tls=tls,
     )
-    path = home / CONFIGURATION_FILE
-    if not path.exists() or path.read_text() != text:
-        path.write_text(text)
+    files.write(home / CONFIGURATION_FILE, text.encode(), mode=_SECRET)
+    user.own((home, home / CONFIGURATION_FILE, security, security.with_name(f"{SECURITY_FILE}.new")))
+
+
+def copy_certificates(home: Path, tls: Tls | None, user: BrokerUser) -> None:
+    """Copy the TLS files for the broker's user.
+
+    Raises:
+        OSError: A file cannot be read or written.
+    """
+    for source, name in zip(tls or (), (CERTIFICATE_FILE, KEY_FILE, AGENTS_CA_FILE, REVOKED_FILE), strict=False):
+        if source is not None:
+            files.write(home / name, source.read_bytes(), mode=_SECRET)
+            user.own([home / name])
 
 
 def configuration(
-    home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_path: str, tls: Tls | None = None
+    *, host: str, tcp_port: int, websocket_port: int, plugin_path: str, max_connections: int, tls: Tls | None = None
 ) -> str:
-    """The text of ``mosquitto.conf``; ``host`` is an IPv4 address."""
+    """The text of ``mosquitto.conf``; ``host`` is an IPv4 address. Paths are relative to the broker's folder."""
     # By default the broker accepts TLS 1.2 and 1.3.
-    server_lines = [] if tls is None else [f"certfile {tls.certificate.absolute()}", f"keyfile {tls.key.absolute()}"]
+    server_lines = [f"max_connections {max_connections}", "max_qos 1"]
+    server_lines += [] if tls is None else [f"certfile {CERTIFICATE_FILE}", f"keyfile {KEY_FILE}"]
     client_lines = []
     if tls is not None and tls.agents is not None:
-        client_lines = [f"cafile {tls.agents.absolute()}", "require_certificate true"]
-        client_lines += [f"crlfile {tls.revoked.absolute()}"] if tls.revoked is not None else []
+        client_lines = [f"cafile {AGENTS_CA_FILE}", "require_certificate true"]
+        client_lines += [f"crlfile {REVOKED_FILE}"] if tls.revoked is not None else []
     lines = [
         "# Written by `python -m infra.mosquitto` at each start; do not edit.",
         "per_listener_settings false",
         "allow_anonymous false",
         f"plugin {plugin_path}",
-        f"plugin_opt_config_file {home.absolute() / SECURITY_FILE}",
+        f"plugin_opt_config_file {SECURITY_FILE}",
         # Nagle's algorithm costs 44 ms for each message at QoS 1.
         "set_tcp_nodelay true",
         # Agents publish retained messages again on connecting, and nothing relies on offline queues.
@@ -145,8 +177,8 @@ def configuration(
         "log_type error",
         "log_type warning",
         "connection_messages false",
-        # As root, mosquitto would otherwise switch to a user that cannot read this folder.
-        f"user {pwd.getpwuid(os.geteuid()).pw_name}",
+        # Only applies to a broker that is started as root, where no other user exists.
+        "user root",
         f"listener {tcp_port} {host}",
         "protocol mqtt",
         *server_lines,
@@ -186,18 +218,33 @@ def initial_security(password: str) -> dict[str, Any]:
     }
 
 
-def _update_rights(security: Path) -> None:
-    """Update the rights of the functions and the default rights to this version; keep everything else."""
+def _update_security(security: Path) -> None:
+    """Update the rights of the functions and the default rights, and remove expired clients; keep everything else."""
     security_data = json.loads(security.read_bytes())
     defaults = security_data.get("defaultACLAccess", {})
     changed = defaults.get("unsubscribe") != _MAY_UNSUBSCRIBE
     security_data["defaultACLAccess"] = {**defaults, "unsubscribe": _MAY_UNSUBSCRIBE}
+    changed = _remove_expired(security_data, time.time()) or changed
     for role in security_data.get("roles", ()):
         if role["rolename"] == SERVICE and _by_topic(role.get("acls", ())) != _by_topic(_service_acls()):
             role["acls"] = _service_acls()
             changed = True
     if changed:
         files.write(security, json.dumps(security_data, indent=1).encode(), mode=_SECRET)
+
+
+def _remove_expired(security_data: dict[str, Any], now_s: float) -> bool:
+    """Remove clients and roles of expired grants; returns whether there were any."""
+    changed = False
+    for kind, key in (("clients", "username"), ("roles", "rolename")):
+        kept = []
+        for entry in security_data.get(kind, ()):
+            issued = mosquitto_clients.parse(entry[key])
+            if issued is None or issued.expires_at > now_s:
+                kept.append(entry)
+        changed = changed or len(kept) != len(security_data.get(kind, ()))
+        security_data[kind] = kept
+    return changed
 
 
 def _by_topic(acls: Iterable[dict[str, Any]]) -> set[tuple[str, str, bool]]:

@@ -8,7 +8,7 @@ import ssl
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import paho.mqtt.client as paho
@@ -17,10 +17,11 @@ from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
 from device_agent.protocol import codec
-from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.security import grants, revocation
 from device_agent.protocol.security.grants import Grant
 from device_agent.protocol.security.revocation import Control, Revoke
+from function_app.adapters.local import mosquitto_clients
+from function_app.adapters.local.mosquitto_clients import ClientQuota, IssuedClient
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials, check_revocation
 
 Publish = Callable[[str, bytes], Awaitable[None]]
@@ -77,15 +78,6 @@ class TokenBrokerAccess:
         """Does nothing."""
 
 
-class _Entry(NamedTuple):
-    """The parts of a username in mosquitto. The role with the same name contains the topics."""
-
-    username: str
-    principal: str
-    client_id: str
-    expires_at: int
-
-
 class _Response(msgspec.Struct, frozen=True, rename={"request_id": "correlationData"}):
     """The response of the dynamic security plugin to one command."""
 
@@ -104,8 +96,9 @@ class _Responses(msgspec.Struct, frozen=True):
 class MosquittoBrokerAccess:
     """Permissions in mosquitto's dynamic security plugin: for each grant a client with a client id, and a role.
 
-    The username is ``principal/client id/expiration/token id``, so that any instance finds revoked and expired grants
-    by listing usernames. Renewed credentials are a new client: the plugin disconnects a client whose password changes.
+    The username contains principal, client id and expiration, so that any instance finds revoked and expired grants by
+    listing usernames. Renewed credentials are a new client: the plugin disconnects a client whose password changes.
+    ``mosquitto_clients`` limits their number.
     """
 
     def __init__(
@@ -114,14 +107,14 @@ class MosquittoBrokerAccess:
         """``username`` is the functions' client in the broker's configuration."""
         self._username = username
         self._password_file = password_file
+        self._quota = ClientQuota()
         self._control = _ControlConnection(host, port, tls)
 
     async def issue(self, grant: Grant) -> Credentials:
-        """See ``BrokerAccess``. One message creates the role and the client."""
+        """See ``BrokerAccess``. One message creates the role and the client; a second one deletes replaced clients."""
         grants.check(grant)
-        if "/" in grant.principal or "/" in grant.token_id:
-            raise ProtocolError("a principal and a token id have no slash")
-        username = "/".join((grant.principal, grant.client_id, str(grant.expires_at), grant.token_id))
+        issued = mosquitto_clients.name(grant)
+        username = issued.username
         password = secrets.token_urlsafe(32)
         role = {"command": "createRole", "rolename": username, "acls": _acls(grant)}
         client = {
@@ -135,6 +128,7 @@ class MosquittoBrokerAccess:
             if response.error:
                 await self._delete([username])
                 raise BrokerAccessError(f"mosquitto rejected {response.command}: {response.error}")
+        await self._delete(self._quota.add(issued, time.time()))
         return Credentials(username, password)
 
     def accepts(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:  # noqa: ARG002
@@ -170,20 +164,17 @@ class MosquittoBrokerAccess:
     async def close(self) -> None:
         await self._control.close()
 
-    async def _entries(self) -> list[_Entry]:
+    async def _entries(self) -> list[IssuedClient]:
         """All clients that ``issue`` created in any instance."""
         response = (await self._execute([{"command": "listClients", "verbose": False, "count": -1, "offset": 0}]))[0]
         if response.error:
             raise BrokerAccessError(f"mosquitto rejected listClients: {response.error}")
-        entries = []
-        for username in response.data.get("clients", []):
-            match username.split("/"):
-                case [principal, client_id, end, _] if end.isdecimal():
-                    entries.append(_Entry(username, principal, client_id, int(end)))
-        return entries
+        parsed = (mosquitto_clients.parse(username) for username in response.data.get("clients", []))
+        return [client for client in parsed if client is not None]
 
     async def _delete(self, usernames: list[str]) -> None:
         """Delete clients and their roles. No error if another instance has deleted them."""
+        self._quota.remove(usernames)
         commands: list[Mapping[str, Any]] = []
         for username in usernames:
             commands += [

@@ -1,11 +1,24 @@
 import json
+import os
+import pwd
 from pathlib import Path
 
-from infra.mosquitto import configuration
+import pytest
+
+from infra.mosquitto import broker_user, configuration
+from infra.mosquitto.broker_user import BrokerUser
 
 
 def write(home: Path, tcp_port: int = 1) -> None:
-    configuration.write(home, host="127.0.0.1", tcp_port=tcp_port, websocket_port=2, plugin_path="/x.so")
+    configuration.write(
+        home,
+        host="127.0.0.1",
+        tcp_port=tcp_port,
+        websocket_port=2,
+        plugin_path="/x.so",
+        max_connections=1000,
+        user=BrokerUser(os.geteuid(), os.getegid()),
+    )
 
 
 def test_everything_is_denied_by_default(tmp_path: Path) -> None:
@@ -50,3 +63,43 @@ def test_the_password_is_only_in_its_own_file(tmp_path: Path) -> None:
     assert password not in (tmp_path / configuration.SECURITY_FILE).read_text()
     assert password not in (tmp_path / configuration.CONFIGURATION_FILE).read_text()
     assert json.loads((tmp_path / configuration.SECURITY_FILE).read_text())["clients"][0]["username"] == "service"
+
+
+def test_a_start_removes_expired_clients_and_keeps_others(tmp_path: Path) -> None:
+    write(tmp_path)
+    path = tmp_path / configuration.SECURITY_FILE
+    security = json.loads(path.read_text())
+    names = ["agent:arm/arm/1/a", f"agent:arm/arm/{2**40}/b", "added by an administrator"]
+    security["clients"] += [{"username": name, "roles": [{"rolename": name}]} for name in names]
+    security["roles"] += [{"rolename": name, "acls": []} for name in names]
+    path.write_text(json.dumps(security))
+    write(tmp_path)
+    updated = json.loads(path.read_text())
+    assert [client["username"] for client in updated["clients"]] == ["service", *names[1:]]
+    assert [role["rolename"] for role in updated["roles"]] == ["service", *names[1:]]
+
+
+@pytest.mark.parametrize(
+    ("users", "uid", "notice"),
+    [
+        ({"mosquitto": 103, "nobody": 65_534}, 103, ""),
+        ({"nobody": 65_534}, 65_534, "runs as nobody"),
+        ({}, 0, "runs as root"),
+        ({"mosquitto": 103}, 0, "this container has no other user"),
+    ],
+)
+def test_root_runs_the_broker_as_a_user_without_rights(
+    users: dict[str, int], uid: int, notice: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def find(name: str) -> pwd.struct_passwd:
+        return pwd.struct_passwd((name, "x", users[name], 106, "", "/", "/bin/false"))
+
+    uid_map = tmp_path / "uid_map"
+    uid_map.write_text("0 1000 1\n" if "container" in notice else "0 0 4294967295\n")
+    monkeypatch.setattr(broker_user, "_UID_MAP", uid_map)
+    monkeypatch.setattr(pwd, "getpwnam", find)
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    chosen = broker_user.choose()
+    assert chosen.uid == uid
+    assert notice in chosen.notice
+    assert bool(notice) == bool(chosen.notice)

@@ -1,0 +1,70 @@
+"""The user that runs mosquitto, and files that this user may read."""
+
+import os
+import pwd
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+_CANDIDATES = ("mosquitto", "nobody")
+"""The user of the package, then a user without rights."""
+_UID_MAP = Path("/proc/self/uid_map")
+
+
+class BrokerUser(NamedTuple):
+    """The user that runs mosquitto.
+
+    Attributes:
+        uid: User id.
+        gid: Group id.
+        notice: Deviation from the recommended user, with advice; may be empty.
+    """
+
+    uid: int
+    gid: int
+    notice: str = ""
+
+    @property
+    def differs(self) -> bool:
+        """Whether mosquitto runs as another user than this program."""
+        return self.uid != os.geteuid()
+
+    def own(self, paths: Iterable[Path]) -> None:
+        """Give the existing ones of these paths to the user. Links are not followed.
+
+        Raises:
+            OSError: The owner cannot be changed.
+        """
+        for path in paths:
+            if self.differs and path.exists():
+                os.chown(path, self.uid, self.gid, follow_symlinks=False)
+
+
+def choose() -> BrokerUser:
+    """The user for mosquitto: a user without rights if this program runs as root, otherwise the current user."""
+    current = BrokerUser(os.geteuid(), os.getegid())
+    if current.uid != 0:
+        return current
+    for name in _CANDIDATES:
+        try:
+            entry = pwd.getpwnam(name)
+        except KeyError:
+            continue
+        if not _exists_here(entry.pw_uid):
+            return current._replace(notice="this container has no other user, so mosquitto runs as the current one")
+        notice = "" if name == _CANDIDATES[0] else _advice(f"it runs as {name}, which other services may use, too")
+        return BrokerUser(entry.pw_uid, entry.pw_gid, notice)
+    return current._replace(notice=_advice("it runs as root"))
+
+
+def _advice(state: str) -> str:
+    return f"no user '{_CANDIDATES[0]}' exists: {state}. Create one: adduser --system --group {_CANDIDATES[0]}"
+
+
+def _exists_here(uid: int) -> bool:
+    """Whether the user namespace of this process, for example of a container, includes the user."""
+    try:
+        ranges = [[int(number) for number in line.split()] for line in _UID_MAP.read_text().splitlines()]
+    except OSError:
+        return True
+    return any(first <= uid < first + count for first, _, count in ranges)
