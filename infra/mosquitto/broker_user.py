@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-_CANDIDATES = ("mosquitto", "nobody")
-"""The user of the package, then a user without rights."""
+_PACKAGE_USER = "mosquitto"
+_OVERFLOW_UID = 65_534
+"""The kernel's user without rights."""
 _UID_MAP = Path("/proc/self/uid_map")
 
 
@@ -45,20 +46,18 @@ def choose() -> BrokerUser:
     current = BrokerUser(os.geteuid(), os.getegid())
     if current.uid != 0:
         return current
-    for name in _CANDIDATES:
-        try:
-            entry = pwd.getpwnam(name)
-        except KeyError:
-            continue
-        if not _exists_here(entry.pw_uid):
-            return current._replace(notice="this container has no other user, so mosquitto runs as the current one")
-        notice = "" if name == _CANDIDATES[0] else _advice(f"it runs as {name}, which other services may use, too")
-        return BrokerUser(entry.pw_uid, entry.pw_gid, notice)
-    return current._replace(notice=_advice("it runs as root"))
-
-
-def _advice(state: str) -> str:
-    return f"no user '{_CANDIDATES[0]}' exists: {state}. Create one: adduser --system --group {_CANDIDATES[0]}"
+    try:
+        entry = pwd.getpwnam(_PACKAGE_USER)
+        chosen = BrokerUser(entry.pw_uid, entry.pw_gid)
+    except KeyError:
+        notice = (
+            f"no user '{_PACKAGE_USER}' exists; mosquitto runs with the user id {_OVERFLOW_UID}, which other services "
+            f"may use, too. Create one: adduser --system --group {_PACKAGE_USER}"
+        )
+        chosen = BrokerUser(_OVERFLOW_UID, _OVERFLOW_UID, notice)
+    if not _exists_here(chosen.uid):
+        return current._replace(notice="this container has no other user, so mosquitto runs as the current one")
+    return chosen
 
 
 def _exists_here(uid: int) -> bool:
