@@ -4,6 +4,7 @@ Only the selected store and cloud adapters are imported. They import their SDKs 
 """
 
 import hashlib
+import shutil
 import ssl
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -55,6 +56,7 @@ class Adapters:
     certificates: Certificates
     password_hashes: PasswordHasher
     catalogue: RobotCatalogue
+    free_bytes: Callable[[], int | None] = lambda: None
 
 
 def adapters(settings: Settings, clock: Clock) -> Adapters:
@@ -85,7 +87,16 @@ def adapters(settings: Settings, clock: Clock) -> Adapters:
         certificates=certificates(settings),
         password_hashes=Argon2Hashes(),
         catalogue=FolderCatalogue(settings.robots),
+        free_bytes=lambda: free_bytes(settings),
     )
+
+
+def free_bytes(settings: Settings) -> int | None:
+    """Free disk space of the store on this machine [bytes]; ``None`` for a cloud store."""
+    if settings.store is not None:
+        return None
+    home = settings.home
+    return shutil.disk_usage(next(folder for folder in (home, *home.parents) if folder.is_dir())).free
 
 
 def keys(settings: Settings, now_ms: Callable[[], int]) -> RingKeys:
@@ -292,4 +303,9 @@ def _files(settings: Settings, signing: RingKeys | None) -> FileBlobs:
         return [hashlib.sha256(b"telescope/v1/blobs" + secret).digest() for secret in secrets]
 
     url = f"{settings.public_url}{BLOBS_PATH}"
-    return FileBlobs(settings.home / "blobs", keys=None if signing is None else derived, url=url)
+
+    def is_full() -> bool:
+        free = free_bytes(settings)
+        return free is not None and free < settings.storage_limits.min_free_mb * 1_000_000
+
+    return FileBlobs(settings.home / "blobs", keys=None if signing is None else derived, url=url, is_full=is_full)

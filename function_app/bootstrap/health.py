@@ -34,5 +34,9 @@ class HealthServices(RobotTypeServices):
     @cached_property
     def telemetry_ingest(self) -> TelemetryIngest:
         return TelemetryIngest(
-            tables=self.tables, writer=self.series_writer, clock=self.clock, observers=(self.diagnostics.observe,)
+            tables=self.tables,
+            writer=self.series_writer,
+            clock=self.clock,
+            observers=(self.diagnostics.observe,),
+            refuse=self.quota.refuse_measurement,
         )

@@ -25,7 +25,7 @@ class RobotTypeServices(TelemetryServices):
 
     @cached_property
     def type_versions(self) -> TypeVersions:
-        return TypeVersions(tables=self.tables, blobs=self.blobs, clock=self.clock)
+        return TypeVersions(tables=self.tables, blobs=self.blobs, quota=self.quota, clock=self.clock)
 
     @cached_property
     def upload_robot_type(self) -> RobotTypeUpload:
@@ -44,6 +44,7 @@ class RobotTypeServices(TelemetryServices):
         return Movements(
             tables=self.tables,
             blobs=self.blobs,
+            quota=self.quota,
             catalogue=self.catalogue,
             robot_types=self.robot_types,
             keys=self.keys,

@@ -40,6 +40,7 @@ class TelemetryServices(DeviceServices):
         return Uploads(
             tables=self.tables,
             blobs=self.blobs,
+            quota=self.quota,
             keep_ms=self.settings.retention.uploads_days * DAY_MS,
             clock=self.clock,
         )

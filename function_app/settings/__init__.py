@@ -24,8 +24,10 @@ from function_app.settings.storage import (
     KeyVault,
     RetentionPeriods,
     SecretsManager,
+    StorageLimits,
     read_keys,
     read_retention,
+    read_storage_limits,
     read_store,
 )
 
@@ -45,6 +47,7 @@ __all__ = [
     "SecretsManager",
     "Settings",
     "SettingsError",
+    "StorageLimits",
     "Tls",
     "Xmpp",
     "read",
@@ -102,6 +105,7 @@ class Settings:
     allow_unconfined_models: bool = False
     rate_limits: RateLimits = field(default_factory=RateLimits)
     retention: RetentionPeriods = field(default_factory=RetentionPeriods)
+    storage_limits: StorageLimits = field(default_factory=StorageLimits)
 
 
 def read(environment: Mapping[str, str] | None = None) -> Settings:
@@ -143,6 +147,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         allow_unconfined_models=env.number("TELESCOPE_ALLOW_UNCONFINED_MODELS", 0, 0, 1) == 1,
         rate_limits=read_rate_limits(env),
         retention=read_retention(env),
+        storage_limits=read_storage_limits(env),
     )
 
 

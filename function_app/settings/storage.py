@@ -92,6 +92,23 @@ class RetentionPeriods:
     level_10min_days: int = 730
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StorageLimits:
+    """Limits of stored data, in megabytes.
+
+    Attributes:
+        account_mb: Captures, scripts and robot types of an account.
+        device_mb: Captures of a device.
+        series_mb: Received measurements of a device in a day.
+        min_free_mb: Disk space that captures and measurements leave free, for stores on this machine.
+    """
+
+    account_mb: int = 20_000
+    device_mb: int = 10_000
+    series_mb: int = 10_000
+    min_free_mb: int = 500
+
+
 def read_store(env: Environment) -> AzureStore | AwsStore | None:
     """The cloud store; ``None`` for files in ``home``."""
     match env.get("TELESCOPE_STORE", "local"):
@@ -158,6 +175,17 @@ def read_keys(env: Environment) -> KeyVault | SecretsManager | None:
             return SecretsManager(region=env.region(), secret=secret(), kms_key=kms_key, endpoint=env.aws_endpoint())
         case _:
             raise env.invalid("TELESCOPE_KEYS", "local, azure or aws")
+
+
+def read_storage_limits(env: Environment) -> StorageLimits:
+    """The limits of stored data."""
+    default = StorageLimits()
+    return StorageLimits(
+        account_mb=env.number("TELESCOPE_MAX_ACCOUNT_MB", default.account_mb, 1, 1_000_000_000),
+        device_mb=env.number("TELESCOPE_MAX_DEVICE_MB", default.device_mb, 1, 1_000_000_000),
+        series_mb=env.number("TELESCOPE_MAX_SERIES_MB", default.series_mb, 1, 1_000_000_000),
+        min_free_mb=env.number("TELESCOPE_MIN_FREE_MB", default.min_free_mb, 0, 1_000_000_000),
+    )
 
 
 def read_retention(env: Environment) -> RetentionPeriods:

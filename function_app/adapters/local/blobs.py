@@ -41,8 +41,19 @@ _DOWNLOAD = "telescope/blobs/download"
 class FileBlobs:
     """``Blobs`` in ``folder``. Reads and writes files in threads."""
 
-    def __init__(self, folder: Path, *, keys: Callable[[], Sequence[bytes]] | None = None, url: str = "") -> None:
-        """The first of ``keys`` signs presigned URLs below ``url``, where ``receive`` and ``send`` are served."""
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        keys: Callable[[], Sequence[bytes]] | None = None,
+        url: str = "",
+        is_full: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """The first of ``keys`` signs presigned URLs below ``url``, where ``receive`` and ``send`` are served.
+
+        ``receive`` ends an upload when ``is_full`` returns true.
+        """
+        self._is_full = is_full
         self._folder = folder
         random_keys = (secrets.token_bytes(32),)
         self._keys = keys or (lambda: random_keys)
@@ -150,8 +161,7 @@ class FileBlobs:
                 if time.time() - path.stat().st_mtime > _ABANDONED_S:
                     path.unlink()
 
-    @staticmethod
-    async def _write(path: Path, content: AsyncIterator[bytes], max_length: int) -> int:
+    async def _write(self, path: Path, content: AsyncIterator[bytes], max_length: int) -> int:
         """Write at most ``max_length`` bytes of the content; returns the number of received bytes."""
         length = 0
         file = await asyncio.to_thread(path.open, "xb")
@@ -160,6 +170,8 @@ class FileBlobs:
                 length += len(part)
                 if length > max_length:
                     break
+                if self._is_full():
+                    raise TransferRefused(507, "The server's disk is almost full. Upload the content again later.")
                 await asyncio.to_thread(file.write, part)
             await asyncio.to_thread(_flush, file)
         finally:

@@ -130,5 +130,5 @@ class RobotTypeCleanup:
 
     async def _drop(self, where: Place, row: Row, version: TypeVersion) -> None:
         """Delete the files first: rows without files are deleted again, files without rows would be lost."""
-        await drop_files(self._blobs, where, version.version)
+        await drop_files(self._tables, self._blobs, where, version.version)
         await records.discard(self._tables, records.ROBOT_TYPES, row)

@@ -29,7 +29,7 @@ from function_app.services.robot_types.rows import (
     record_refusal,
     schedule_check,
 )
-from function_app.services.storage import records
+from function_app.services.storage import quota, records
 from function_app.services.storage.retention import DAY_MS
 
 LEASE_MS = 60_000
@@ -117,7 +117,7 @@ class ModelValidator:
             await store_verdict(self._tables, where, number, report.errors, self._clock.now_ms(), warnings=warnings)
             _, upload = await read_version(self._tables, where, number)
         if upload is None:
-            await drop_files(self._blobs, where, number)  # the cleanup may have run concurrently
+            await drop_files(self._tables, self._blobs, where, number)  # the cleanup may have run concurrently
 
     async def _compile(self, where: Place, upload: TypeVersion) -> ModelReport:
         names = list(upload.files)
@@ -135,10 +135,11 @@ class ModelValidator:
         return replace(report, errors=(*known, *references, *malformed_files))
 
 
-async def drop_files(blobs: Blobs, where: Place, number: int) -> None:
+async def drop_files(tables: Tables, blobs: Blobs, where: Place, number: int) -> None:
     """Delete all files of a version."""
     for name in await blobs.list(where.prefix(number)):
         await blobs.delete(name)
+    await quota.release(tables, where.account, where.prefix(number))
 
 
 async def store_verdict(

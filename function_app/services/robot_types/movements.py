@@ -27,6 +27,7 @@ from function_app.services.robot_types.catalogue import RobotTypes
 from function_app.services.robot_types.script_metadata import Script, read_script
 from function_app.services.robot_types.script_store import ScriptStore, blob_name
 from function_app.services.storage import records
+from function_app.services.storage.quota import StorageQuota
 from function_app.services.storage.retention import DAY_MS, Retention
 
 MAX_OWN = 1_000
@@ -60,6 +61,7 @@ class Movements:
         *,
         tables: Tables,
         blobs: Blobs,
+        quota: StorageQuota,
         catalogue: RobotCatalogue,
         robot_types: RobotTypes,
         keys: SigningKeys,
@@ -68,7 +70,7 @@ class Movements:
         clock: Clock,
     ) -> None:
         self._tables = tables
-        self._scripts = ScriptStore(blobs=blobs, keys=keys)
+        self._scripts = ScriptStore(tables=tables, blobs=blobs, quota=quota, keys=keys)
         self._catalogue = catalogue
         self._types = robot_types
         self._retention = retention
@@ -158,7 +160,7 @@ class Movements:
 
         Raises:
             Problem: ``robot-type-unknown``, ``movement-invalid`` with the line, ``schema-invalid``, ``movements-full``,
-                ``movement-changed`` with the newest version.
+                ``movement-changed`` with the newest version, ``quota-exceeded``, ``storage-full``.
         """
         await self._types.get(caller, robot_type)
         if not ID.match(name):

@@ -11,6 +11,9 @@ from function_app.domain.identity.accounts import Identity
 from function_app.domain.robot_types.movements import Movement
 from function_app.ports.blobs import Blobs
 from function_app.ports.signing_keys import SigningKeys
+from function_app.ports.tables import Tables
+from function_app.services.storage import quota
+from function_app.services.storage.quota import StorageQuota
 
 _KEPT = 256
 
@@ -18,8 +21,10 @@ _KEPT = 256
 class ScriptStore:
     """Scripts by account, robot type, name, version and hash, so that deletions do not affect other versions."""
 
-    def __init__(self, *, blobs: Blobs, keys: SigningKeys) -> None:
+    def __init__(self, *, tables: Tables, blobs: Blobs, quota: StorageQuota, keys: SigningKeys) -> None:
+        self._tables = tables
         self._blobs = blobs
+        self._quota = quota
         self._keys = keys
         self._kept: OrderedDict[str, str] = OrderedDict()
 
@@ -30,8 +35,14 @@ class ScriptStore:
         return replace(movement, key=signing.key_id(key.public_key()), signature=signature)
 
     async def put(self, caller: Identity, robot_type: str, movement: Movement, source: str) -> None:
-        """Store a script, before the rows that refer to it."""
-        await self._blobs.put(blob_name(caller, robot_type, movement), source.encode())
+        """Store a script, before the rows that refer to it.
+
+        Raises:
+            Problem: ``quota-exceeded``, ``storage-full``.
+        """
+        name, content = blob_name(caller, robot_type, movement), source.encode()
+        await self._quota.reserve(caller.account, name, len(content))
+        await self._blobs.put(name, content)
 
     async def get(self, caller: Identity, robot_type: str, movement: Movement) -> str:
         """A script with valid signature and hash.
@@ -63,7 +74,9 @@ class ScriptStore:
 
     async def delete(self, caller: Identity, robot_type: str, movement: Movement) -> None:
         """Delete a script without rows."""
-        await self._blobs.delete(blob_name(caller, robot_type, movement))
+        name = blob_name(caller, robot_type, movement)
+        await self._blobs.delete(name)
+        await quota.release(self._tables, caller.account, name)
 
     async def _verify(self, robot_type: str, movement: Movement) -> None:
         key = (await self._keys.archive()).get(movement.key)

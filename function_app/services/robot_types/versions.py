@@ -9,9 +9,10 @@ from function_app.domain.robot_types.robot_types import TypeVersion
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.robot_types.model_validation import drop_files
+from function_app.services.robot_types.model_validation import drop_files, store_verdict
 from function_app.services.robot_types.rows import Place, add_job, read_version
 from function_app.services.storage import records as store
+from function_app.services.storage.quota import StorageQuota
 
 GIVE_UP_MS = 120_000
 """Time after which an upload without a verdict is rejected."""
@@ -23,8 +24,9 @@ _POLL_S = 0.1
 class TypeVersions:
     """Processes versions of robot types and previews."""
 
-    def __init__(self, *, tables: Tables, blobs: Blobs, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, blobs: Blobs, quota: StorageQuota, clock: Clock) -> None:
         self._tables = tables
+        self._quota = quota
         self._blobs = blobs
         self._clock = clock
 
@@ -32,8 +34,15 @@ class TypeVersions:
         """Store the files of an ``uploading`` version, and create a validation job.
 
         Raises:
-            Problem: ``busy``: it took too long, and the cleanup has rejected the version.
+            Problem: ``busy``: it took too long, and the cleanup has rejected the version. ``quota-exceeded``,
+                ``storage-full``: the version is rejected.
         """
+        size = sum(len(content) for content in files.values())
+        try:
+            await self._quota.reserve(where.account, where.prefix(version), size)
+        except Problem as problem:
+            await store_verdict(self._tables, where, version, (problem.detail,), self._clock.now_ms())
+            raise
         for name, content in files.items():
             await self._blobs.put(where.prefix(version) + name, content)
         row, upload = await read_version(self._tables, where, version)
@@ -45,7 +54,7 @@ class TypeVersions:
                 stored = True
         if not stored:
             # The version was rejected or the type deleted: the files are not needed.
-            await drop_files(self._blobs, where, version)
+            await drop_files(self._tables, self._blobs, where, version)
             raise busy_store()
         await add_job(self._tables, where, version, self._clock.now_ms())
 

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from function_app.ports.blobs import Blobs
 from function_app.ports.tables import MAX_BATCH, Conflict, Row, Tables, Write
-from function_app.services.storage import records
+from function_app.services.storage import quota, records
 
 DAY_MS: Final = 86_400_000
 SHARDS = 8
@@ -78,6 +78,7 @@ class Retention:
         target = note.data
         if "blob" in target:
             await self._blobs.delete(target["blob"])
+            await quota.release_owned(self._tables, target["blob"])
             return True
         table, partition, last = target["table"], target["partition"], target["last"]
         first, seen = target["first"], 0

@@ -71,12 +71,20 @@ class TelemetryIngest:
     """Ingests telemetry. Idempotent; messages of unclaimed agents are dropped."""
 
     def __init__(
-        self, *, tables: Tables, writer: SeriesWriter, clock: Clock, observers: Sequence[Observer] = ()
+        self,
+        *,
+        tables: Tables,
+        writer: SeriesWriter,
+        clock: Clock,
+        observers: Sequence[Observer] = (),
+        refuse: Callable[[str, int], str] = lambda _device, _bytes: "",
     ) -> None:
+        """``refuse`` returns why a message of a device, of a size [bytes], is not stored; empty: it is stored."""
         self._tables = tables
         self._writer = writer
         self._clock = clock
         self._observers = tuple(observers)
+        self._refuse = refuse
         self._agents: dict[str, _Agent] = {}
         self._turn = 0
 
@@ -105,6 +113,9 @@ class TelemetryIngest:
             except ProtocolError as error:
                 _log.warning("%s of %s dropped: %s", message.topic.name, device.id, error)
                 dropped[number] = str(error)
+                continue
+            if reason := self._refuse(device.id, len(message.payload)):
+                dropped[number] = reason
                 continue
             devices[device.id] = device
             parts[device.id, message.topic.name].append(sample)

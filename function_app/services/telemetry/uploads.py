@@ -16,7 +16,8 @@ from function_app.ports import blobs as port
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables, Write
-from function_app.services.storage import records
+from function_app.services.storage import quota, records
+from function_app.services.storage.quota import StorageQuota
 
 LIFETIME_S = 3_600
 """Lifetime of upload and download URLs [s]."""
@@ -47,6 +48,7 @@ class Capture:
         blob: Blob name.
         by: Account or agent that uploaded it.
         expires_ms: Time of deletion [ms since 1970].
+        account: Owner of the device at the upload, whose storage it uses.
     """
 
     id: str
@@ -63,6 +65,7 @@ class Capture:
     state: Literal["waiting", "stored"] = "waiting"
     verified: bool = False
     stored_ms: int = 0
+    account: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,8 +91,9 @@ class StoredCapture:
 class Uploads:
     """Captures of devices. ``device`` must be visible to the caller."""
 
-    def __init__(self, *, tables: Tables, blobs: Blobs, keep_ms: int, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, blobs: Blobs, quota: StorageQuota, keep_ms: int, clock: Clock) -> None:
         self._tables = tables
+        self._quota = quota
         self._blobs = blobs
         self._keep_ms = keep_ms
         self._clock = clock
@@ -99,7 +103,7 @@ class Uploads:
         """A new capture, and the request that uploads it.
 
         Raises:
-            Problem: ``invalid``, ``too-many-uploads``.
+            Problem: ``invalid``, ``too-many-uploads``, ``quota-exceeded``, ``storage-full``.
         """
         if not 0 <= announced.length <= port.MAX_UPLOAD_BYTES:
             raise invalid(f"An upload has 0 to {port.MAX_UPLOAD_BYTES} bytes.")
@@ -114,12 +118,19 @@ class Uploads:
             content_type=announced.content_type,
             length=announced.length,
             sha256=announced.sha256,
-            blob=f"uploads/{device.id}/{device.pairing}/{id_}",
+            blob=_blob(_partition(device), id_),
             by=by,
             created_ms=now_ms,
             expires_ms=now_ms + UNREGISTERED_MS,
+            account=device.owner,
         )
-        await self._schedule_deletion(device, capture.id, capture.expires_ms)
+        await self._schedule_deletion(device, capture, capture.expires_ms)
+        try:
+            await self._quota.reserve(device.owner, capture.blob, capture.length, device=device.id)
+        except Problem:
+            deletion = _deletion(device, capture, capture.expires_ms)
+            await records.remove(self._tables, records.UPLOADS, deletion.partition, deletion.key)
+            raise
         await self._tables.create(records.UPLOADS, Row(_partition(device), _waiting(id_), records.to_data(capture)))
         request = await self._blobs.presign_upload(
             capture.blob, length=capture.length, content_type=capture.content_type, lifetime_s=LIFETIME_S
@@ -143,7 +154,7 @@ class Uploads:
         registered = replace(
             capture, state="stored", verified=verified, stored_ms=now_ms, expires_ms=now_ms + self._keep_ms
         )
-        await self._schedule_deletion(device, capture.id, registered.expires_ms)
+        await self._schedule_deletion(device, capture, registered.expires_ms)
         writes = [
             Write("delete", waiting),
             Write("create", Row(waiting.partition, _registered(capture.id), records.to_data(registered))),
@@ -193,7 +204,7 @@ class Uploads:
         """
         result = await self._stored(device, upload)
         now_ms = self._clock.now_ms()
-        await self._schedule_deletion(device, result.capture.id, now_ms)
+        await self._schedule_deletion(device, result.capture, now_ms)
         # From here on it is deleted for all callers, even if this process is killed.
         ended = replace(result.capture, expires_ms=now_ms)
         row = Row(result.row.partition, result.row.key, records.to_data(ended), result.row.etag)
@@ -201,6 +212,7 @@ class Uploads:
             row = await self._tables.replace(records.UPLOADS, row)
             await self._blobs.delete(ended.blob)
             await self._tables.delete(records.UPLOADS, row)
+            await quota.release(self._tables, ended.account, ended.blob)
         except Conflict as error:
             raise busy_store() from error
 
@@ -215,13 +227,18 @@ class Uploads:
         shard = f"{_DUE}:{self._turn % SHARDS}"
         page = await self._tables.query(records.UPLOADS, shard, last=f"{now_ms + 1:013d}", limit=_MAX_DELETIONS)
         for deletion in page.rows:
+            partition, id_ = deletion.data["partition"], deletion.data["id"]
+            remains = False
             try:
-                for key in (_waiting(deletion.data["id"]), _registered(deletion.data["id"])):
-                    row = await self._tables.get(records.UPLOADS, deletion.data["partition"], key)
+                for key in (_waiting(id_), _registered(id_)):
+                    row = await self._tables.get(records.UPLOADS, partition, key)
                     # A later expiry time has its own deletion.
                     if row is not None and row.data["expires_ms"] <= now_ms:
                         await self._blobs.delete(row.data["blob"])
                         await self._tables.delete(records.UPLOADS, row)
+                    remains = remains or (row is not None and row.data["expires_ms"] > now_ms)
+                if not remains and deletion.data.get("account"):
+                    await quota.release(self._tables, deletion.data["account"], _blob(partition, id_))
                 await self._tables.delete(records.UPLOADS, deletion)
             except Conflict:
                 _log.debug("another process deletes %s", deletion.key)
@@ -263,19 +280,27 @@ class Uploads:
             detail = f"{MAX_UNREGISTERED} uploads of this device are not completed. Complete them, or wait a day."
             raise Problem("too-many-uploads", 409, "Too many uploads", detail)
 
-    async def _schedule_deletion(self, device: Device, upload: str, due_ms: int) -> None:
+    async def _schedule_deletion(self, device: Device, capture: Capture, due_ms: int) -> None:
         """Schedule the deletion, before the capture is written."""
-        partition = _partition(device)
-        shard = hashlib.sha256(upload.encode()).digest()[0] % SHARDS
-        row = Row(f"{_DUE}:{shard}", f"{due_ms:013d}:{partition}/{upload}", {"partition": partition, "id": upload})
         try:
-            await self._tables.create(records.UPLOADS, row)
+            await self._tables.create(records.UPLOADS, _deletion(device, capture, due_ms))
         except Conflict:
             return
 
 
 def _partition(device: Device) -> str:
     return f"{device.id}/{device.pairing}"
+
+
+def _deletion(device: Device, capture: Capture, due_ms: int) -> Row:
+    partition = _partition(device)
+    shard = hashlib.sha256(capture.id.encode()).digest()[0] % SHARDS
+    data = {"partition": partition, "id": capture.id, "account": capture.account}
+    return Row(f"{_DUE}:{shard}", f"{due_ms:013d}:{partition}/{capture.id}", data)
+
+
+def _blob(partition: str, upload: str) -> str:
+    return f"uploads/{partition}/{upload}"
 
 
 def _waiting(upload: str) -> str:

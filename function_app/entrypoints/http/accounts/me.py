@@ -19,7 +19,16 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     async def me(request: Request) -> Response:
         """Returns the account and session of the token or cookie; for a cookie also the CSRF token."""
         caller, csrf = (await auth.account(request), None) if bearer(request) else await auth.page(request)
-        body = schemas.AccountOut(id=caller.account, name=caller.name, session=caller.session, csrf_token=csrf)
+        usage, limits = await functions.quota.usage(caller.account), functions.quota.limits
+        storage = schemas.StorageOut(
+            used_bytes=usage.total_bytes,
+            limit_bytes=limits.account_bytes,
+            device_limit_bytes=limits.device_bytes,
+            devices=usage.device_bytes,
+        )
+        body = schemas.AccountOut(
+            id=caller.account, name=caller.name, session=caller.session, csrf_token=csrf, storage=storage
+        )
         return json_response(body, headers={"Cache-Control": "no-store"})
 
     @routes.add(

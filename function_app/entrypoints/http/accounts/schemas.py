@@ -87,6 +87,15 @@ class AccessToken(Response, frozen=True, kw_only=True):
     expires_in_s: int
 
 
+class StorageOut(Response, frozen=True, kw_only=True):
+    """Stored captures, movements and robot types of an account [bytes]; ``devices``: captures by device."""
+
+    used_bytes: int
+    limit_bytes: int
+    device_limit_bytes: int
+    devices: dict[str, int]
+
+
 class AccountOut(Response, frozen=True, kw_only=True):
     """The signed-in account. ``csrf_token`` is required in requests with the cookie; null for a bearer token."""
 
@@ -94,6 +103,7 @@ class AccountOut(Response, frozen=True, kw_only=True):
     name: str
     session: str
     csrf_token: str | None
+    storage: StorageOut
 
 
 class SessionOut(Response, frozen=True, kw_only=True):

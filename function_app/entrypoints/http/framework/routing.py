@@ -42,10 +42,11 @@ _MEANINGS = {
     403: "Not allowed",
     404: "Not found",
     409: "Conflict with the current state",
-    413: "The body is too large",
+    413: "The body is too large, or the storage of the account or device is used up",
     422: "Invalid request",
     429: "Too many requests; see Retry-After",
     503: "The store or the broker is unavailable; see Retry-After",
+    507: "The server's disk is full",
 }
 
 

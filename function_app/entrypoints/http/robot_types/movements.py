@@ -64,7 +64,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         "PUT /robot-types/{robot_type}/movements/{name}",
         "Save a movement",
         {200: schemas.MovementOut, 201: schemas.MovementOut},
-        (404, 409),
+        (404, 409, 507),
         body=schemas.MovementRequest,
     )
     async def put_movement(request: Request, robot_type: str, name: str) -> Response:

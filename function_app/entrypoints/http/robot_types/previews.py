@@ -18,7 +18,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         "POST /robot-type-previews",
         "Create a robot type preview",
         {201: schemas.RobotTypePreviewOut, 202: schemas.RobotTypePreviewOut},
-        409,
+        (409, 507),
         body=schemas.RobotTypePreviewRequest,
     )
     async def add_robot_type_preview(request: Request) -> Response:
@@ -55,7 +55,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         "POST /robot-type-previews/{preview}/save",
         "Save a preview as a robot type",
         {200: schemas.RobotTypeOut, 201: schemas.RobotTypeOut, 202: schemas.RobotTypeOut},
-        (404, 409),
+        (404, 409, 413, 507),
         optional_body=schemas.SaveRobotTypePreviewRequest,
     )
     async def save_robot_type_preview(request: Request, preview: str) -> Response:

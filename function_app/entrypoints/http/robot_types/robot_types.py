@@ -28,7 +28,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         "POST /robot-types",
         "Upload a robot type",
         {200: schemas.RobotTypeOut, 201: schemas.RobotTypeOut, 202: schemas.RobotTypeOut},
-        (404, 409),
+        (404, 409, 507),
         body=schemas.RobotTypeRequest,
     )
     async def add_robot_type(request: Request) -> Response:

@@ -34,7 +34,7 @@ def _for_accounts(routes: Routes, functions: Functions, auth: RequestAuthenticat
         "POST /devices/{device}/uploads",
         "Start an upload",
         {201: schemas.UploadStarted},
-        (404, 409),
+        (404, 409, 507),
         body=schemas.UploadRequest,
     )
     async def begin_upload(request: Request, device: str) -> Response:
@@ -79,7 +79,7 @@ def _for_agents(routes: Routes, functions: Functions, auth: RequestAuthenticator
         "POST /agents/{agent}/uploads",
         "Start an upload of an agent",
         {201: schemas.UploadStarted},
-        (404, 409),
+        (404, 409, 507),
         body=schemas.AgentUploadRequest,
         caller="agent",
     )
