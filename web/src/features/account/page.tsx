@@ -9,7 +9,7 @@ import { texts } from "./texts";
 import { ApiKeys } from "./api-keys";
 import { auditLogAddress, deviceListAddress } from "../../shared/routing/routes";
 
-/** The user's account: password, other sessions, API keys and audit log. */
+/** The user's account: password, storage, other sessions, API keys and audit log. */
 export function AccountPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const [changes, setChanges] = useState(0);
   return (
@@ -21,8 +21,24 @@ export function AccountPage({ api, fleet }: { api: Api; fleet: Fleet }) {
       </p>
       <ApiKeys api={api} fleet={fleet} />
       <PasswordForm api={api} onDone={() => setChanges((count) => count + 1)} />
+      <Storage api={api} />
       <Sessions key={changes} api={api} />
     </main>
+  );
+}
+
+function Storage({ api }: { api: Api }) {
+  const [usage, setUsage] = useState(common.loading);
+  useEffect(() => {
+    api.storage().then(
+      (storage) => setUsage(texts.account.used(storage.used_bytes, storage.limit_bytes)),
+      (error: unknown) => setUsage(sentence(error)),
+    );
+  }, [api]);
+  return (
+    <Card title={texts.account.storage}>
+      <p aria-live="polite">{usage}</p>
+    </Card>
   );
 }
 

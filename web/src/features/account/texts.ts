@@ -37,6 +37,9 @@ export const texts = {
     new: "New password",
     change: "Set password",
     changed: "Password set.",
+    storage: "Storage",
+    used: (usedBytes: number, limitBytes: number): string =>
+      `${format.oneDigit(usedBytes / 1e6)} MB of ${Math.round(limitBytes / 1e6)} MB are in use by captures, movements and robot types.`,
     sessions: "Active sessions",
     session: (how: string, since: string): string => `By ${how}, since ${since}`,
     method: { link: "link", password: "password", "oidc": "your identity provider" },

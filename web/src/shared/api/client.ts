@@ -1,5 +1,5 @@
 /** The HTTP API calls of the console. The session uses an HttpOnly cookie. */
-import type { Account, Action, ActionCallOptions, ControlRequestInfo, Credentials, Device, GrantedLease, LatencyBatch, Lease, Purpose, Series, SignInMethods, SignInSession, Space, Upload, Watcher } from "./types";
+import type { Account, Action, ActionCallOptions, ControlRequestInfo, Credentials, Device, GrantedLease, LatencyBatch, Lease, Purpose, Series, SignInMethods, SignInSession, Space, StorageUsage, Upload, Watcher } from "./types";
 import { HealthApi } from "./health";
 import { LatencyApi } from "./latency";
 import { Http, type Page } from "./http";
@@ -87,6 +87,10 @@ export class Api {
     const { csrf_token: csrf, ...account } = await this.#http.call<Account & { csrf_token: string | null }>("GET", "/accounts/me");
     this.#http.setCsrfToken(csrf ?? "");
     return account;
+  }
+
+  async storage(): Promise<StorageUsage> {
+    return (await this.#http.call<{ storage: StorageUsage }>("GET", "/accounts/me")).storage;
   }
 
   devices(): Promise<Device[]> {

@@ -8,6 +8,12 @@ export interface Account {
   session: string;
 }
 
+/** Stored captures, movements and robot types of the account. */
+export interface StorageUsage {
+  used_bytes: number;
+  limit_bytes: number;
+}
+
 /** Available sign-in methods; `oidc`: OpenID Connect provider. */
 export interface SignInMethods {
   password: boolean;

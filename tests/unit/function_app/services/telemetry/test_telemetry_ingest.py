@@ -11,7 +11,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.domain.telemetry import series
 from function_app.domain.telemetry.series import Samples
 from function_app.services.storage import records
-from function_app.services.telemetry.ingest import BACKLOG_MS, DROP_MS, SHARDS, InboundMessage, _Part
+from function_app.services.telemetry.ingest import BACKLOG_MS, DROP_MS, SHARDS, InboundMessage, TelemetryIngest, _Part
 from tests.harness.crash_injection import Killed
 from tests.unit.function_app.services.telemetry.telemetry_fixture import (
     AGENT,
@@ -162,3 +162,15 @@ async def test_an_unavailable_store_raises_and_the_same_messages_can_be_stored_l
     setup.crash.left = None
     await setup.ingest.ingest([message(NOW_MS, a=1.0)])
     await assert_whole(setup, {NOW_MS: {"a": 1.0}})
+
+
+async def test_a_refused_measurement_is_dropped_with_the_reason_and_others_are_stored(setup: TelemetrySetup) -> None:
+    ingest = TelemetryIngest(
+        tables=setup.tables,
+        writer=setup.writer,
+        clock=setup.clock,
+        refuse=lambda _, size: "the disk is full" if size > 200 else "",
+    )
+    large = message(NOW_MS, **{f"field_{number}": 1.0 for number in range(20)})
+    assert await ingest.ingest([large, message(NOW_MS + 1, x=1.0)]) == {0: "the disk is full"}
+    await assert_whole(setup, {NOW_MS + 1: {"x": 1.0}})
