@@ -14,6 +14,8 @@ MAX_BATCH_BYTES = 1_000_000
 """Maximum size of a batch as JSON [bytes]. Azure accepts 4 MiB per request; its SDK escapes up to three bytes for
 one, and keys and headers of 100 writes take up to 750 KB. DynamoDB accepts 4 MB."""
 MAX_DATA_BYTES = 256 * 1024
+SCHEMA = 1
+"""Version of the row formats that this server writes. Raise it with every change of a stored record."""
 MAX_KEY_LENGTH = 512
 
 
@@ -27,12 +29,22 @@ class StoreError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One row. ``etag`` is empty until the store assigns one."""
+    """One row.
+
+    Attributes:
+        etag: Empty until the store assigns one.
+        schema: Highest ``SCHEMA`` of the servers that wrote the row; 0: written before rows had a version.
+    """
 
     partition: str
     key: str
     data: Mapping[str, Any] = field(default_factory=dict)
     etag: str = ""
+    schema: int = SCHEMA
+
+    def changed(self, data: Mapping[str, Any]) -> "Row":
+        """The row with the fields of ``data``. Other fields stay: a newer server may have written them."""
+        return Row(self.partition, self.key, {**self.data, **data}, self.etag, self.schema)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +72,7 @@ class Tables(Protocol):
     Example::
 
         row = await tables.create("Devices", Row("agent", "arm", {"label": "Arm"}))
-        await tables.replace("Devices", dataclasses.replace(row, data={"label": "Left arm"}))
+        await tables.replace("Devices", row.changed({"label": "Left arm"}))
     """
 
     async def get(self, table: str, partition: str, key: str) -> Row | None:

@@ -25,7 +25,7 @@ class MemoryTables:
     async def get(self, table: str, partition: str, key: str) -> Row | None:
         await asyncio.sleep(0)
         row = self.partition(table, partition).rows.get(key)
-        return None if row is None else Row(partition, key, row_codec.decode(row[1]), row[0])
+        return None if row is None else row_codec.decode(partition, key, row[1], row[0])
 
     async def create(self, table: str, row: Row) -> Row:
         return (await self._apply(table, [Write("create", row)]))[0]
@@ -53,7 +53,7 @@ class MemoryTables:
         begin = bisect.bisect_left(existing.keys, start)
         end = len(existing.keys) if last is None else bisect.bisect_left(existing.keys, last)
         stored = [(key, *existing.rows[key]) for key in existing.keys[begin : min(end, begin + limit)]]
-        rows = tuple(Row(partition, key, row_codec.decode(text), etag) for key, etag, text in stored)
+        rows = tuple(row_codec.decode(partition, key, text, etag) for key, etag, text in stored)
         following = begin + limit
         return Page(rows, row_codec.write_cursor(existing.keys[following]) if following < end else None)
 
@@ -75,7 +75,7 @@ class MemoryTables:
     def rows(self, *tables: str) -> list[tuple[str, Row]]:
         """Every row with its table, or those of the given tables."""
         return [
-            (table, Row(partition, key, row_codec.decode(text), etag))
+            (table, row_codec.decode(partition, key, text, etag))
             for (table, partition), stored in sorted(self._partitions.items())
             if not tables or table in tables
             for key, (etag, text) in sorted(stored.rows.items())

@@ -15,6 +15,7 @@ import random
 import secrets
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from function_app.adapters.aws import names
@@ -147,7 +148,7 @@ class DynamoTables:
     async def _put(self, table: str, write: Write) -> Row:
         row_codec.check(write.row)
         row = _written(write)
-        change = _change(table, write, row, row_codec.encode(row.data))["Put"]
+        change = _change(table, write, row, row_codec.encode(row))["Put"]
         try:
             await self._write("put_item", TableName=self._table, **change)
         except ServiceError as error:
@@ -187,7 +188,7 @@ class DynamoTables:
 
 def _written(write: Write) -> Row:
     row = write.row
-    return row if write.kind == "delete" else Row(row.partition, row.key, row.data, secrets.token_hex(8))
+    return row if write.kind == "delete" else replace(row, etag=secrets.token_hex(8))
 
 
 def _change(table: str, write: Write, row: Row, text: bytes) -> dict[str, dict[str, Any]]:
@@ -217,7 +218,7 @@ def _partition(table: str, partition: str) -> str:
 
 def _row(partition: str, item: dict[str, Any]) -> Row:
     key = item.get("name", item["k"])["S"]
-    return Row(partition, key, row_codec.decode(item["data"]["S"]), item["etag"]["S"])
+    return row_codec.decode(partition, key, item["data"]["S"], item["etag"]["S"])
 
 
 def _range(partition: str, start: str, last: str | None) -> dict[str, Any]:

@@ -67,13 +67,13 @@ class AzureTables:
 
     async def create(self, table: str, row: Row) -> Row:
         row_codec.check(row)
-        entity = _entity(row, row_codec.encode(row.data))
+        entity = _entity(row, row_codec.encode(row))
         return await self._put(table, row, entity, lambda to: to.create_entity(entity, retry_on_methods=_RETRIED))
 
     async def replace(self, table: str, row: Row) -> Row:
         row_codec.check(row)
         _check_etag(table, row)
-        entity = _entity(row, row_codec.encode(row.data))
+        entity = _entity(row, row_codec.encode(row))
         return await self._put(
             table, row, entity, lambda to: to.update_entity(entity, **_if_match(row), **_REPLACE), create_table=False
         )
@@ -264,7 +264,7 @@ def _parts(text: str) -> Iterator[str]:
 
 def _row(partition: str, entity: Mapping[str, Any]) -> Row:
     parts = itertools.takewhile(bool, (entity.get(f"Data{number}", "") for number in itertools.count()))
-    return Row(partition, _key(entity), row_codec.decode("".join(parts)), _etag(entity))
+    return row_codec.decode(partition, _key(entity), "".join(parts), _etag(entity))
 
 
 def _row_key(entity: Mapping[str, Any]) -> str:

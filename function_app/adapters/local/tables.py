@@ -43,7 +43,7 @@ class SqliteTables:
 
     async def get(self, table: str, partition: str, key: str) -> Row | None:
         found = self._run(_GET, (table, partition, key)).fetchone()
-        return None if found is None else Row(partition, key, row_codec.decode(found[1]), found[0])
+        return None if found is None else row_codec.decode(partition, key, found[1], found[0])
 
     async def create(self, table: str, row: Row) -> Row:
         return self._write_one(table, Write("create", row))
@@ -70,7 +70,7 @@ class SqliteTables:
             found = self._run(_QUERY_OPEN, (table, partition, start, limit + 1)).fetchall()
         else:
             found = self._run(_QUERY_CLOSED, (table, partition, start, last, limit + 1)).fetchall()
-        page = tuple([Row(partition, key, row_codec.decode(data), etag) for key, etag, data in found[:limit]])
+        page = tuple([row_codec.decode(partition, key, data, etag) for key, etag, data in found[:limit]])
         return Page(page, row_codec.write_cursor(found[limit][0]) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
@@ -91,7 +91,7 @@ class SqliteTables:
 
     def _write_one(self, table: str, write: Write) -> Row:
         row_codec.check(write.row)
-        return self._write(table, write, b"" if write.kind == "delete" else row_codec.encode(write.row.data))
+        return self._write(table, write, b"" if write.kind == "delete" else row_codec.encode(write.row))
 
     def _write(self, table: str, write: Write, data: bytes) -> Row:
         row = write.row
@@ -107,7 +107,7 @@ class SqliteTables:
         else:
             cursor = self._run(_REPLACE, (etag, data, table, row.partition, row.key, row.etag))
             self._expect_one(cursor, table, row)
-        return Row(row.partition, row.key, row.data, etag)
+        return Row(row.partition, row.key, row.data, etag, row.schema)
 
     @staticmethod
     def _expect_one(cursor: sqlite3.Cursor, table: str, row: Row) -> None:

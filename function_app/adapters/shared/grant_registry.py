@@ -152,7 +152,7 @@ class GrantRegistry:
         await for_each([grant.client_id for grant in issued if grant.issued_s <= revoked.before_s], disconnect)
         data = msgspec.to_builtins(_Revoked(revoked.before_s, settled=True))
         with contextlib.suppress(Conflict):  # a newer revocation replaced it
-            await self._tables.replace(TABLE, Row(row.partition, row.key, data, row.etag))
+            await self._tables.replace(TABLE, row.changed(data))
 
     async def _clients_of(self, principal: str) -> list[str]:
         if "+" in _group(principal):
@@ -182,9 +182,11 @@ class GrantRegistry:
     async def _write(self, partition: str, key: str, data: dict[str, Any]) -> None:
         for _ in range(_TRIES):
             row = await self._tables.get(TABLE, partition, key)
-            new = Row(partition, key, data, row.etag if row else "")
             with contextlib.suppress(Conflict):
-                await (self._tables.replace(TABLE, new) if row else self._tables.create(TABLE, new))
+                if row is None:
+                    await self._tables.create(TABLE, Row(partition, key, data))
+                else:
+                    await self._tables.replace(TABLE, row.changed(data))
                 return
         raise StoreError("too many concurrent changes of the broker's permissions")
 

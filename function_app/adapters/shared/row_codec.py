@@ -2,14 +2,18 @@
 
 import base64
 import binascii
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
-from function_app.ports.tables import MAX_BATCH, MAX_BATCH_BYTES, MAX_DATA_BYTES, MAX_KEY_LENGTH, Row, Write
+from function_app.ports.tables import MAX_BATCH, MAX_BATCH_BYTES, MAX_DATA_BYTES, MAX_KEY_LENGTH, SCHEMA, Row, Write
 
 MAX_PAGE = 1_000
+_SCHEMA_FIELD = "~schema"
+"""Stored with a row's data. No record has a field of this name."""
+_SCHEMA_BYTES = len(f',"{_SCHEMA_FIELD}":{SCHEMA}')
+"""Not part of the size of the data."""
 
 _encode = msgspec.json.Encoder().encode
 _decode = msgspec.json.Decoder(dict[str, Any]).decode
@@ -45,8 +49,8 @@ def check_batch(writes: Sequence[Write]) -> tuple[bytes, ...]:
             raise ValueError("a batch writes each key once")
         keys.add(write.row.key)
         check(write.row)
-        texts.append(b"" if write.kind == "delete" else encode(write.row.data))
-    size = sum(map(len, texts))
+        texts.append(b"" if write.kind == "delete" else encode(write.row))
+    size = sum(map(len, texts)) - _SCHEMA_BYTES * sum(map(bool, texts))
     if size > MAX_BATCH_BYTES:
         raise ValueError(f"a batch writes at most {MAX_BATCH_BYTES} bytes, not {size}; split it")
     return tuple(texts)
@@ -62,21 +66,23 @@ def check_limit(limit: int) -> None:
         raise ValueError(f"limit must be 1 to {MAX_PAGE}, not {limit}")
 
 
-def encode(data: Mapping[str, Any]) -> bytes:
-    """A row's data as JSON.
+def encode(row: Row) -> bytes:
+    """A row's data and schema version as JSON.
 
     Raises:
         ValueError: More than ``MAX_DATA_BYTES``.
     """
-    text = _encode(data)
+    text = _encode(row.data)
     if len(text) > MAX_DATA_BYTES:
         raise ValueError(f"a row holds at most {MAX_DATA_BYTES} bytes, not {len(text)}")
-    return text
+    comma = b"," if row.data else b""
+    return b'%s%s"%s":%d}' % (text[:-1], comma, _SCHEMA_FIELD.encode(), max(row.schema, SCHEMA))
 
 
-def decode(text: bytes | str) -> dict[str, Any]:
-    """A row's data from JSON."""
-    return _decode(text)
+def decode(partition: str, key: str, text: bytes | str, etag: str) -> Row:
+    """A row from its JSON."""
+    data = _decode(text)
+    return Row(partition, key, data, etag, data.pop(_SCHEMA_FIELD, 0))
 
 
 def write_cursor(key: str) -> str:

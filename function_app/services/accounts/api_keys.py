@@ -184,9 +184,7 @@ class ApiKeys:
         try:
             row = await self._tables.get(records.API_KEYS, key.id, API_KEY)
             if row is not None:
-                await self._tables.replace(
-                    records.API_KEYS, Row(row.partition, row.key, records.to_data(used), row.etag)
-                )
+                await self._tables.replace(records.API_KEYS, row.changed(records.to_data(used)))
         except (Conflict, StoreError) as error:
             _log.warning("the use of API key %s was not recorded: %s", key.id, error)
         return used

@@ -109,7 +109,7 @@ class Passwords:
                 if row is None:
                     await self._tables.create(records.ACCOUNTS, Row(caller.account, _PASSWORD, data))
                 else:
-                    await self._tables.replace(records.ACCOUNTS, Row(caller.account, _PASSWORD, data, row.etag))
+                    await self._tables.replace(records.ACCOUNTS, row.changed(data))
             except Conflict as conflict:
                 detail = "The password was changed concurrently. Use the new one as the old password."
                 raise forbidden(detail) from conflict
@@ -173,8 +173,6 @@ class Passwords:
         """Store the password with current parameters."""
         created = _Stored(await self._hasher.make(normalize(password)), self._clock.now_ms())
         try:
-            await self._tables.replace(
-                records.ACCOUNTS, Row(row.partition, row.key, records.to_data(created), row.etag)
-            )
+            await self._tables.replace(records.ACCOUNTS, row.changed(records.to_data(created)))
         except Conflict:
             return  # changed concurrently

@@ -1,7 +1,7 @@
 """Stores actions. Ending an action also frees its slot, lease and place in the queue."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from function_app.domain.actions.action import Action, Status
 from function_app.domain.actions.queue import FAILED_BEFORE
@@ -82,7 +82,7 @@ class ActionStore:
             changed = change(stored.action)
             if changed is stored.action:
                 return stored
-            writes = [Write("replace", replace(stored.row, data=records.to_data(changed)))]
+            writes = [Write("replace", stored.row.changed(records.to_data(changed)))]
             waited_for = False
             if changed.status.terminal:
                 control = await read_control_rows(self._tables, changed.device)

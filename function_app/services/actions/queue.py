@@ -7,7 +7,6 @@ start when a person releases control.
 
 import logging
 from collections.abc import Callable, Collection
-from dataclasses import replace
 from typing import Final
 
 from function_app.domain.actions.action import RETRY_MS, Action, Status, end, give_turn
@@ -186,7 +185,7 @@ class ActionQueues:
         )
         started = give_turn(stored.action, lease.epoch, now_ms)
         writes = [
-            Write("replace", replace(stored.row, data=records.to_data(started))),
+            Write("replace", stored.row.changed(records.to_data(started))),
             control.write_slot(device.id, started.id, device.pairing),
             control.write_queue(device.id, control.queue.without(started.id)),
         ]

@@ -225,7 +225,7 @@ class AuditLog:
         except (Problem, StoreError) as error:
             _log.warning("audit of %s: %s", entry.event, error)
             with contextlib.suppress(Conflict, StoreError):
-                await self._tables.replace(records.AUDIT, replace(waiting, data=fields))
+                await self._tables.replace(records.AUDIT, waiting.changed(fields))
 
     async def drop(self, waiting: Row) -> None:
         """Delete a pending entry without a record."""
@@ -292,7 +292,7 @@ class AuditLog:
             if job.once:
                 writes.append(Write("create", Row(owner, job.once, {"seq": head.seq})))
         signed = await self._signed(owner, head)
-        writes.append(Write("replace" if row else "create", Row(owner, _HEAD, signed, row.etag if row else "")))
+        writes.append(records.write(row, owner, _HEAD, signed))
         await self._tables.batch(records.AUDIT, writes)
 
     async def _signed(self, owner: str, head: Head) -> dict[str, Any]:

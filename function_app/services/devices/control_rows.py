@@ -37,8 +37,7 @@ class ControlRows:
         return self._write(device, QUEUE, records.to_data(queue))
 
     def _write(self, device: str, key: str, data: dict[str, object]) -> Write:
-        row = self.rows.get(key)
-        return Write("replace" if row else "create", Row(device, key, data, row.etag if row else ""))
+        return records.write(self.rows.get(key), device, key, data)
 
 
 async def read_control(tables: Tables, device: Device) -> ControlRows:

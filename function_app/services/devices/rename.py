@@ -5,7 +5,7 @@ from function_app.domain.common.problems import not_found
 from function_app.domain.devices import devices as rules
 from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
-from function_app.ports.tables import Row, Tables
+from function_app.ports.tables import Tables
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.devices.device_access import DeviceAccess, require_owner
 from function_app.services.storage import records
@@ -35,6 +35,6 @@ class DeviceRename:
                     raise not_found("device", device.id)
                 changed = rules.rename(agent, device.name, label)
                 await change.store_pending()
-                await self._tables.replace(records.AGENTS, Row(agent.id, "agent", records.to_data(changed), row.etag))
+                await self._tables.replace(records.AGENTS, row.changed(records.to_data(changed)))
 
             await records.retry(attempt)

@@ -122,7 +122,7 @@ class Diagnostics:
             if row is None:
                 await self._tables.create(records.DIAGNOSTICS, Row(_partition(device), stream, data))
             else:
-                await self._tables.replace(records.DIAGNOSTICS, Row(row.partition, stream, data, row.etag))
+                await self._tables.replace(records.DIAGNOSTICS, row.changed(data))
 
         await records.retry(attempt)
 

@@ -90,7 +90,7 @@ class Faults:
             existing = records.read(row, Fault)
             seen = rules.acknowledged(existing, by=by, now_ms=self._clock.now_ms())
             if seen is not existing:
-                write = Write("replace", Row(row.partition, row.key, records.to_data(seen), row.etag))
+                write = Write("replace", row.changed(records.to_data(seen)))
                 await self._write(device, seen, "acknowledged", [write])
             return seen
 
@@ -110,7 +110,7 @@ class Faults:
             existing = records.read(row, Fault)
             worsened = rules.reported(existing, report)
             if worsened is not existing:
-                write = Write("replace", Row(partition, key, records.to_data(worsened), row.etag))
+                write = Write("replace", row.changed(records.to_data(worsened)))
                 await self._write(device, worsened, f"worsened-{worsened.worse}", [write])
             return worsened is not existing
         now_ms = self._clock.now_ms()
@@ -120,10 +120,9 @@ class Faults:
         fault = rules.raised(report, fault=new_suffix(now_ms), now_ms=now_ms, count=count)
         expires_ms = now_ms + KEEP_FAULTS_MS
         await self._retention.delete_row_at(records.FAULTS, partition, count_key, due_ms=expires_ms)
-        number = Row(partition, count_key, {"count": count, "expires_ms": expires_ms}, counted.etag if counted else "")
         writes = [
             Write("create", Row(partition, key, records.to_data(fault))),
-            Write("replace" if counted else "create", number),
+            records.write(counted, partition, count_key, {"count": count, "expires_ms": expires_ms}),
         ]
         await self._write(device, fault, "raised", writes)
         return True

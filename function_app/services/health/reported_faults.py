@@ -101,7 +101,7 @@ class ReportedFaults:
             if newest is None:
                 await self._tables.create(records.WATCHED, Row(shard, f"agent:{agent}", {"note": key}))
             elif newest.data["note"] < key:
-                await self._tables.replace(records.WATCHED, Row(shard, newest.key, {"note": key}, newest.etag))
+                await self._tables.replace(records.WATCHED, newest.changed({"note": key}))
 
         await records.retry(attempt)
 

@@ -121,7 +121,7 @@ class Mailbox:
             awaited = records.read(row, AwaitedAck)
             if awaited.status is None or (ack.status.terminal and not awaited.status.terminal):
                 data = records.to_data(replace(awaited, status=ack.status))
-                await self._tables.replace(records.MAILBOX, replace(row, data=data))
+                await self._tables.replace(records.MAILBOX, row.changed(data))
 
         await records.retry(attempt)
         self._notify(agent)

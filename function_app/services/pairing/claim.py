@@ -9,7 +9,7 @@ from function_app.domain.devices import devices
 from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
-from function_app.ports.tables import Row, Tables
+from function_app.ports.tables import Tables
 from function_app.services.audit.audit_log import AuditLog, Change
 from function_app.services.identity.guess_limiter import Guess, GuessLimiter, by_address
 from function_app.services.identity.sign_in import SignIn
@@ -110,5 +110,5 @@ class Claim:
         await records.upsert(
             self._tables, records.MEMBERS, caller.account, f"agent:{agent.id}", lambda _: member, _Member
         )
-        await self._tables.replace(records.AGENTS, Row(agent.id, "agent", records.to_data(claimed), row.etag))
+        await self._tables.replace(records.AGENTS, row.changed(records.to_data(claimed)))
         return claimed

@@ -7,7 +7,7 @@ from function_app.domain.common.ids import new_claim_code
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent, DeviceSpec, Transport, with_devices
 from function_app.ports.clock import Clock
-from function_app.ports.tables import Conflict, Row, Tables, Write
+from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.pairing.offboarding import Offboarding
 from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS, Retention
@@ -74,8 +74,7 @@ class Enroll:
                     records.AGENTS, agent, "agent", due_ms=(delete_ms // DAY_MS + 1) * DAY_MS
                 )
                 record = replace(record, claim_code=code, claim_expires_ms=expires_ms, expires_ms=delete_ms)
-            new = Row(agent, "agent", records.to_data(record), row.etag if row else "")
-            await self._tables.batch(records.AGENTS, [Write("replace" if row else "create", new)])
+            await self._tables.batch(records.AGENTS, [records.write(row, agent, "agent", records.to_data(record))])
             return record
 
         record = await records.retry(attempt)

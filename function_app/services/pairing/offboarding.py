@@ -20,7 +20,7 @@ from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable, CommandBus
-from function_app.ports.tables import Conflict, Row, Tables
+from function_app.ports.tables import Conflict, Tables
 from function_app.services.actions.action_store import ActionStore
 from function_app.services.actions.queue import ActionQueues
 from function_app.services.control.control_events import ControlEvents
@@ -199,7 +199,7 @@ class Offboarding:
             agent = records.read(row, Agent)
             left = tuple(leaving for leaving in agent.leaving if leaving not in completed)
             created = records.to_data(replace(agent, leaving=left))
-            await self._tables.replace(records.AGENTS, Row(agent_id, "agent", created, row.etag))
+            await self._tables.replace(records.AGENTS, row.changed(created))
 
         await records.retry(attempt)
 

@@ -7,7 +7,7 @@ from function_app.domain.common.problems import not_found
 from function_app.domain.devices import devices as rules
 from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
-from function_app.ports.tables import Row, Tables
+from function_app.ports.tables import Tables
 from function_app.services.audit.audit_log import AuditLog, Change
 from function_app.services.identity.sign_in import SignIn
 from function_app.services.pairing.offboarding import Offboarding
@@ -69,7 +69,7 @@ class Unpair:
                     await self._offboarding.watch(agent_id)
                     scheduled = True
                 await change.store_pending()
-                await self._tables.replace(records.AGENTS, Row(agent_id, "agent", records.to_data(changed), row.etag))
+                await self._tables.replace(records.AGENTS, row.changed(records.to_data(changed)))
             return changed
 
         return await records.retry(attempt)

@@ -19,7 +19,6 @@ from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services.robot_types.package_reader import malformed, missing
 from function_app.services.robot_types.rows import (
     CHECKS,
-    HEAD,
     REPORT,
     Place,
     after_account,
@@ -101,7 +100,7 @@ class ModelValidator:
     async def _take(self, note: Row) -> Row:
         until_ms = self._clock.now_ms() + LEASE_MS
         data = {**note.data, "until_ms": until_ms, "tries": note.data["tries"] + 1}
-        return await self._tables.replace(records.MODEL_CHECKS, replace(note, data=data))
+        return await self._tables.replace(records.MODEL_CHECKS, note.changed(data))
 
     async def _check(self, note: Row) -> None:
         where, number = job_target(note)
@@ -160,12 +159,11 @@ async def store_verdict(
         wrong = _sentences((*upload.errors, *errors))
         state: State = "rejected" if wrong else "ready"
         done = replace(upload, state=state, errors=wrong, warnings=warnings, checked_ms=now_ms)
-        version_row = Row(row.partition, row.key, records.to_data(done), row.etag)
-        writes = [Write("replace", version_row)]
+        writes = [Write("replace", row.changed(records.to_data(done)))]
         if not wrong:
             await schedule_check(tables, where, now_ms + DAY_MS)
             head_data = records.to_data(with_ready(head, done))
-            writes.append(Write("replace", Row(row.partition, HEAD, head_data, head_row.etag)))
+            writes.append(Write("replace", head_row.changed(head_data)))
         await tables.batch(records.ROBOT_TYPES, writes)
 
     await records.retry(attempt)

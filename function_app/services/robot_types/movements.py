@@ -340,7 +340,7 @@ class Movements:
 def _writes(partition: str, movement: Movement, row: Row | None) -> list[Write]:
     data = records.to_data(movement)
     return [
-        Write("replace" if row else "create", Row(partition, movement.name, data, row.etag if row else "")),
+        records.write(row, partition, movement.name, data),
         Write("create", Row(partition, _version_key(movement.name, movement.version), data)),
     ]
 

@@ -156,7 +156,7 @@ class RobotTypePreview:
             await schedule_check(self._tables, where, self._clock.now_ms())
             if row is not None and head is not None and not head.deleted:
                 deleted = records.to_data(replace(head, deleted=True))
-                await self._tables.replace(records.ROBOT_TYPES, Row(row.partition, row.key, deleted, row.etag))
+                await self._tables.replace(records.ROBOT_TYPES, row.changed(deleted))
 
         await records.retry(attempt)
 

@@ -113,9 +113,11 @@ class RobotTypeUpload:
             following = next_version(head, package.robot_type.version, where.type)
             plain = TypeVersion(following.last, "uploading", manifest, sizes, self._clock.now_ms())
             upload = await self._integrity.sealed(where.account, where.type, plain, package.files)
-            new_head = Row(where.partition, HEAD, records.to_data(following), row.etag if row else "")
             new_version = Row(where.partition, version_key(following.last), records.to_data(upload))
-            writes = [Write("replace" if row else "create", new_head), Write("create", new_version)]
+            writes = [
+                records.write(row, where.partition, HEAD, records.to_data(following)),
+                Write("create", new_version),
+            ]
             change.data["version"] = following.last
             await change.store_pending()
             await self._tables.batch(records.ROBOT_TYPES, writes)

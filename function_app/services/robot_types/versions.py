@@ -8,7 +8,7 @@ from function_app.domain.common.problems import Problem, busy_store, invalid
 from function_app.domain.robot_types.robot_types import TypeVersion
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
-from function_app.ports.tables import Conflict, Row, Tables
+from function_app.ports.tables import Conflict, Tables
 from function_app.services.robot_types.model_validation import drop_files, store_verdict
 from function_app.services.robot_types.rows import Place, add_job, read_version
 from function_app.services.storage import records as store
@@ -48,9 +48,8 @@ class TypeVersions:
         row, upload = await read_version(self._tables, where, version)
         stored = False
         if row is not None and upload is not None and upload.state == "uploading":
-            data = {**row.data, "state": "checking"}
             with contextlib.suppress(Conflict):
-                await self._tables.replace(store.ROBOT_TYPES, Row(row.partition, row.key, data, row.etag))
+                await self._tables.replace(store.ROBOT_TYPES, row.changed({"state": "checking"}))
                 stored = True
         if not stored:
             # The version was rejected or the type deleted: the files are not needed.

@@ -88,7 +88,7 @@ class OwnershipTransfer:
             await records.upsert(
                 self._tables, records.MEMBERS, invitation.taken_by, f"agent:{agent_id}", lambda _: member, _Member
             )
-            await self._tables.replace(records.AGENTS, Row(agent_id, "agent", records.to_data(changed), row.etag))
+            await self._tables.replace(records.AGENTS, row.changed(records.to_data(changed)))
             return changed
 
         agent = await records.retry(attempt)

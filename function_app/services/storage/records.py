@@ -3,13 +3,13 @@
 import asyncio
 import contextlib
 import random
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from typing import Any, TypeVar
 
 import msgspec
 
 from function_app.domain.common.problems import busy_store, invalid_cursor
-from function_app.ports.tables import Conflict, Page, Row, Tables
+from function_app.ports.tables import Conflict, Page, Row, Tables, Write
 
 ACCOUNTS = "Accounts"
 """Partition: account id (or ``name:<name>``, ``open-id:<hash>``); keys ``account``, ``space:<id>``, ``session:<id>``,
@@ -93,6 +93,13 @@ def to_data(record: Any) -> dict[str, Any]:
     return data
 
 
+def write(existing: Row | None, partition: str, key: str, data: Mapping[str, Any]) -> Write:
+    """The write that creates a row, or changes the existing one."""
+    if existing is None:
+        return Write("create", Row(partition, key, data))
+    return Write("replace", existing.changed(data))
+
+
 async def find(tables: Tables, table: str, partition: str, key: str, kind: type[T]) -> tuple[Row | None, T | None]:
     """The row and its record; ``None`` twice if there is no such row."""
     row = await tables.get(table, partition, key)
@@ -100,12 +107,12 @@ async def find(tables: Tables, table: str, partition: str, key: str, kind: type[
 
 
 async def update(tables: Tables, table: str, row: Row, record: Any) -> None:
-    """Replace the record of a row.
+    """Change the record of a row.
 
     Raises:
         Conflict: The row was changed concurrently.
     """
-    await tables.replace(table, Row(row.partition, row.key, to_data(record), row.etag))
+    await tables.replace(table, row.changed(to_data(record)))
 
 
 async def discard(tables: Tables, table: str, row: Row | None) -> None:
@@ -149,7 +156,7 @@ async def upsert(  # noqa: PLR0917 (a place, a change, a type: read best in this
         if row is None:
             await tables.create(table, Row(partition, key, data))
         else:
-            await tables.replace(table, Row(partition, key, data, row.etag))
+            await tables.replace(table, row.changed(data))
         return record
 
     return await retry(attempt)

@@ -91,7 +91,7 @@ class Retention:
             if page.cursor is None:
                 return True
             first, seen = page.rows[-1].key + "\0", seen + len(page.rows)
-        await self._tables.replace(records.FORGET, Row(note.partition, note.key, {**target, "first": first}, note.etag))
+        await self._tables.replace(records.FORGET, note.changed({"first": first}))
         return False
 
 

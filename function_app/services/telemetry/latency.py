@@ -227,8 +227,7 @@ class LatencyStore:
 
 
 def _write(partition: str, key: str, record: Any, old: Row | None) -> Write:
-    data = records.to_data(record)
-    return Write("replace" if old else "create", Row(partition, key, data, old.etag if old else ""))
+    return records.write(old, partition, key, records.to_data(record))
 
 
 def _mark(day: int) -> str:

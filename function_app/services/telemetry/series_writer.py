@@ -75,9 +75,7 @@ class _CachedRows:
     def write(self, partition: str, key: str, data: dict[str, Any]) -> Write:
         """The write that creates or replaces a row."""
         row = self.about if key == ABOUT else self.rows.get(key)
-        if row is None:
-            return Write("create", Row(partition, key, data))
-        return Write("replace", Row(partition, key, data, row.etag))
+        return records.write(row, partition, key, data)
 
 
 _Windows = Sequence[tuple[int, Samples]]

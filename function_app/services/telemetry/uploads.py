@@ -207,7 +207,7 @@ class Uploads:
         await self._schedule_deletion(device, result.capture, now_ms)
         # From here on it is deleted for all callers, even if this process is killed.
         ended = replace(result.capture, expires_ms=now_ms)
-        row = Row(result.row.partition, result.row.key, records.to_data(ended), result.row.etag)
+        row = result.row.changed(records.to_data(ended))
         try:
             row = await self._tables.replace(records.UPLOADS, row)
             await self._blobs.delete(ended.blob)

@@ -15,6 +15,7 @@ from function_app.ports.tables import (
     MAX_BATCH_BYTES,
     MAX_DATA_BYTES,
     MAX_KEY_LENGTH,
+    SCHEMA,
     Conflict,
     Row,
     Tables,
@@ -86,6 +87,14 @@ class TablesSuite:
         await tables.delete("T", second)
         assert await tables.get("T", "p", "k") is None
         await refuse(second.etag)
+
+    async def test_a_change_keeps_other_fields_and_the_schema_version_of_a_newer_server(self, tables: Tables) -> None:
+        row = await tables.create("T", Row("p", "k", DATA, schema=SCHEMA + 1))
+        assert row == await tables.get("T", "p", "k")
+        await tables.batch("T", [Write("replace", row.changed({"int": 1}))])
+        changed = await tables.get("T", "p", "k")
+        assert changed is not None
+        assert (changed.data, changed.schema) == ({**DATA, "int": 1}, SCHEMA + 1)
 
     async def test_each_write_has_a_new_etag(self, tables: Tables) -> None:
         row = await tables.create("T", Row("p", "k", {"n": 1}))

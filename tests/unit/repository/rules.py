@@ -1,5 +1,6 @@
 """Rules for the structure and the language of the repository. Each function returns the violations it finds."""
 
+import ast
 import re
 import subprocess
 from collections import Counter
@@ -9,6 +10,8 @@ from typing import Final
 
 MAX_ENTRIES: Final = 16
 MAX_LINES: Final = 400
+ROW_FIELDS: Final = 3
+"""Partition, key and data of a new row."""
 SOURCES: Final = frozenset({".py", ".ts", ".tsx", ".css", ".mjs", ".cjs", ".lua"})
 TEXTS: Final = SOURCES | {".md", ".toml", ".html", ".yml", ".service"}
 WIDE_FOLDERS: Final = {
@@ -78,6 +81,17 @@ def dialect(root: Path, files: Iterable[str]) -> list[str]:
         if PurePosixPath(name).suffix in TEXTS
         for number, line in enumerate((root / name).read_text(encoding="utf-8").splitlines(), 1)
         if FORBIDDEN_WORDS.search(line)
+    ]
+
+
+def replaced_rows(root: Path, files: Iterable[str]) -> list[str]:
+    """Returns each construction of a row with an ETag: ``Row.changed`` also keeps unknown fields."""
+    return [
+        f"{name}:{node.lineno}"
+        for name in files
+        if name.startswith(("function_app/services/", "function_app/adapters/shared/grant"))
+        for node in ast.walk(ast.parse((root / name).read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Row" and len(node.args) > ROW_FIELDS
     ]
 
 

@@ -9,7 +9,9 @@ from tests.harness.paths import ROOT
 from tests.unit.repository import rules
 
 
-@pytest.mark.parametrize("rule", [rules.wide_folders, rules.long_files, rules.unclear_names, rules.dialect])
+@pytest.mark.parametrize(
+    "rule", [rules.wide_folders, rules.long_files, rules.unclear_names, rules.dialect, rules.replaced_rows]
+)
 def test_the_repository_follows_the_rule(rule: Callable[[Path, list[str]], list[str]]) -> None:
     assert rule(ROOT, rules.tracked_files(ROOT)) == []
 
@@ -43,3 +45,10 @@ def test_a_file_with_an_unclear_name_is_found(tmp_path: Path, stem: str) -> None
 def test_a_forbidden_word_is_found(tmp_path: Path, words: tuple[str, str], name: str) -> None:
     (tmp_path / name).write_text(f"# The agent\n# {''.join(words)} x\n", encoding="utf-8")
     assert rules.dialect(tmp_path, [name]) == [f"{name}:2: # {''.join(words)} x"]
+
+
+def test_a_row_that_replaces_another_without_its_unknown_fields_is_found(tmp_path: Path) -> None:
+    name = "function_app/services/pairing.py"
+    (tmp_path / name).parent.mkdir(parents=True)
+    (tmp_path / name).write_text("row.changed(data)\nRow('p', 'k', data)\nRow('p', 'k', data, row.etag)\n", "utf-8")
+    assert rules.replaced_rows(tmp_path, [name]) == [f"{name}:3"]

@@ -76,6 +76,11 @@ def written() -> Iterator[Written]:
     memory.loop.end()
 
 
+def data_of(text: bytes) -> dict[str, Any]:
+    """The row without its schema version, which the chain does not cover: it changes no record."""
+    return {name: value for name, value in json.loads(text).items() if "schema" not in name}
+
+
 def test_an_unchanged_chain_is_intact(written: Written) -> None:
     assert written.head.seq == 10
     assert written.check(written.rows, written.head) == ""
@@ -90,7 +95,7 @@ def test_changed_fields(written: Written) -> None:
     for name, text in written.rows.items():
         record = json.loads(text)
         place = f"record {int(name.rpartition(':')[2])}" if name != "head" else ""
-        for field, value in record.items():
+        for field, value in data_of(text).items():
             other = value + 1 if isinstance(value, int) else "x" if isinstance(value, str) else {"n": 99}
             for changed in (
                 {**record, field: other},
@@ -111,7 +116,7 @@ def test_changed_bytes(written: Written) -> None:
             changed = bytearray(text)
             changed[place] ^= 1
             try:
-                same = json.loads(bytes(changed)) == json.loads(text)
+                same = data_of(bytes(changed)) == data_of(text)
             except ValueError:
                 continue  # the store cannot read this row
             if not same:
