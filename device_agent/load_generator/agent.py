@@ -13,7 +13,7 @@ from device_agent.load_generator.metrics import Metrics
 from device_agent.load_generator.options import LoadOptions
 from device_agent.load_generator.robot import SimulatedRobot
 from device_agent.ports.clock import CloudClock, wall_ms
-from device_agent.protocol import Presence, codec, topics
+from device_agent.protocol import KINDS, PROTOCOL, Presence, codec, topics
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.transports.backoff import BackOff
 from device_agent.transports.http import responses
@@ -139,7 +139,16 @@ class LoadAgent:
             self._connection.publish(topic, payload, qos=qos, retain=retain)
 
     def _presence(self, *, online: bool) -> bytes:
-        return codec.encode(Presence(online=online, session=self._session, at_ms=wall_ms(), software=SOFTWARE))
+        return codec.encode(
+            Presence(
+                online=online,
+                session=self._session,
+                at_ms=wall_ms(),
+                software=SOFTWARE,
+                protocol=PROTOCOL,
+                capabilities=KINDS,
+            )
+        )
 
     async def _pause(self, wait_s: float) -> None:
         try:

@@ -11,6 +11,7 @@ import msgspec
 
 from device_agent.protocol.acks import Ack, AckStatus, Reason
 from device_agent.protocol.commands import (
+    KINDS,
     LANGUAGE_PATTERN,
     SHIPPED,
     CancelAction,
@@ -64,6 +65,7 @@ from device_agent.protocol.events import Event
 from device_agent.protocol.fields import FIELD_PATTERN, MAX_VALUES, Field, Id, Label, Pose, Quaternion, Text, Vector3
 from device_agent.protocol.state import (
     ActionState,
+    Capabilities,
     Fault,
     LeaseState,
     Mode,
@@ -74,17 +76,18 @@ from device_agent.protocol.state import (
     StopLatch,
 )
 from device_agent.protocol.telemetry import JointTelemetry, Measurements
+from device_agent.protocol.versions import PROTOCOL, VersionRange, common_version, incompatibility
 
 __all__ = [
-    "FIELD_PATTERN", "LANGUAGE_PATTERN", "MAX_VALUES", "SHIPPED", "Ack", "AckStatus", "ActionState", "BaseLimits",
-    "Body", "CancelAction", "CaptureRaw", "CollectData", "Command", "Control", "Description", "Diagnostic", "Drive",
-    "DriveTarget", "Event", "Express", "Fault", "Field", "Geometry", "GoTo", "GrantLease", "Id", "InterlockDescription",
-    "JogTarget", "Joint", "JointTarget", "JointTelemetry", "Label", "LeaseState", "LookAt", "Measurements", "Mode",
-    "MoveJoints", "MovePose", "OpenRequest", "Pose", "Presence", "Quaternion", "Reason", "ReleaseLease", "Request",
-    "RequestControl", "ResetStop", "Restriction", "RobotTask", "RoomTask", "RotateKey", "RunBehaviour", "RunMovement",
-    "Say", "SetControl", "SetStiffness", "Setpoint", "State", "Stop", "StopDevice", "StopLatch", "Stream",
-    "TakePicture", "TakePosture", "Task", "Text", "Twin", "TwinJoint", "Vector3", "WithdrawRequest",
-    "schema_components",
+    "FIELD_PATTERN", "KINDS", "LANGUAGE_PATTERN", "MAX_VALUES", "PROTOCOL", "SHIPPED", "Ack", "AckStatus",
+    "ActionState", "BaseLimits", "Body", "CancelAction", "Capabilities", "CaptureRaw", "CollectData", "Command",
+    "Control", "Description", "Diagnostic", "Drive", "DriveTarget", "Event", "Express", "Fault", "Field", "Geometry",
+    "GoTo", "GrantLease", "Id", "InterlockDescription", "JogTarget", "Joint", "JointTarget", "JointTelemetry", "Label",
+    "LeaseState", "LookAt", "Measurements", "Mode", "MoveJoints", "MovePose", "OpenRequest", "Pose", "Presence",
+    "Quaternion", "Reason", "ReleaseLease", "Request", "RequestControl", "ResetStop", "Restriction", "RobotTask",
+    "RoomTask", "RotateKey", "RunBehaviour", "RunMovement", "Say", "SetControl", "SetStiffness", "Setpoint", "State",
+    "Stop", "StopDevice", "StopLatch", "Stream", "TakePicture", "TakePosture", "Task", "Text", "Twin", "TwinJoint",
+    "Vector3", "VersionRange", "WithdrawRequest", "common_version", "incompatibility", "schema_components",
 ]  # fmt: skip
 
 

@@ -1,9 +1,10 @@
 """Messages to a device: signed commands, streamed setpoints and Stop.
 
-Unknown fields are rejected: an older agent must not execute part of a newer command.
+An unknown kind is rejected, an unknown field is ignored. A new field must therefore be safe to ignore; a parameter
+that an older agent must not ignore needs a new kind.
 """
 
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from msgspec import Meta, Struct
 
@@ -14,7 +15,7 @@ LANGUAGE_PATTERN = r"([A-Za-z]{1,8}(-[A-Za-z0-9]{1,8})*)?"
 """Language tag as in BCP 47 (``en``, ``sk``, ``en-GB``), or empty."""
 
 
-class _Request(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind"):
+class _Request(Struct, frozen=True, kw_only=True, tag_field="kind"):
     """Base of all requests; the tag ``kind`` names the request."""
 
 
@@ -245,9 +246,11 @@ Request = (
     | ResetStop
     | RotateKey
 )
+KINDS = tuple(sorted(str(kind.__struct_config__.tag) for kind in get_args(Request)))
+"""Every kind of request, as agents and servers report them."""
 
 
-class Command(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Command(Struct, frozen=True, kw_only=True):
     """``cmd``: a request to a device; the body of ``signing.Signed``.
 
     ``space``, ``agent`` and ``device`` bind it to one device, ``epoch`` binds it to one lease. It runs at most once per
@@ -292,7 +295,7 @@ class DriveTarget(_Request, frozen=True, kw_only=True, tag="drive"):
     turn_rad_s: float = 0.0
 
 
-class Setpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Setpoint(Struct, frozen=True, kw_only=True):
     """One streamed setpoint; the body of ``setpoints.Tagged``. The newest is used; ``sequence`` rises in each lease.
 
     Attributes:

@@ -1,10 +1,14 @@
 """Retained condition of agents and devices. Readers ignore unknown fields."""
 
 from enum import StrEnum
+from typing import Annotated
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from device_agent.protocol.fields import Count, Id, Label, Milliseconds, Text
+from device_agent.protocol.versions import VersionRange
+
+Capabilities = Annotated[tuple[Label, ...], Meta(max_length=128, description="kinds of request")]
 
 _UNVERIFIED = " (unverified)"
 
@@ -13,12 +17,18 @@ class Presence(Struct, frozen=True, kw_only=True):
     """``conn``: whether the agent is connected to the broker. Retained, and the MQTT will.
 
     ``session`` rises with each connection. Readers ignore ``online=False`` with a lower session than the newest one.
+
+    Attributes:
+        protocol: Versions of the wire contract that the agent supports.
+        capabilities: Kinds of request that the agent accepts; empty: not reported.
     """
 
     online: bool
     session: Count
     at_ms: Milliseconds
     software: Label = ""
+    protocol: VersionRange = VersionRange()
+    capabilities: Capabilities = ()
 
 
 class Mode(StrEnum):

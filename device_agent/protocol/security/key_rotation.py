@@ -20,7 +20,7 @@ Statement = Annotated[str, Meta(min_length=1, max_length=1024)]
 Serial = Annotated[int, Meta(ge=1, le=2**53)]
 
 
-class NewKey(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class NewKey(Struct, frozen=True, kw_only=True):
     """``key`` becomes valid now; keys with a lower ``serial`` remain valid until ``former_until_ms`` (cloud clock).
 
     ``serial`` only rises, so no statement can restore an older key.

@@ -21,7 +21,7 @@ COMMAND_CONTEXT = b"telescope/v1/command\n"
 MOVEMENT_CONTEXT = b"telescope/v1/movement\n"
 
 
-class Signed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Signed(Struct, frozen=True, kw_only=True):
     """``cmd`` on the wire: ``body`` is a ``Command``, ``key`` names the public key, ``signature`` is base64url."""
 
     key: str

@@ -14,6 +14,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from requests.auth import AuthBase
 
 from device_agent.ports.clock import CloudClock, tick_ms
+from device_agent.protocol import KINDS, PROTOCOL, Capabilities, VersionRange, incompatibility
 from device_agent.protocol.security import signing
 from device_agent.transports.http.session import Session
 
@@ -43,11 +44,16 @@ class CloudError(ValueError):
 
 
 class Claim(msgspec.Struct, frozen=True, kw_only=True):
-    """Result of an enrollment: a claim code, valid for ``expires_in_s`` [s]; no code once the agent is paired."""
+    """Result of an enrollment: a claim code, valid for ``expires_in_s`` [s]; no code once the agent is paired.
+
+    ``protocol`` and ``capabilities``: versions that the server supports, and the requests that it can send.
+    """
 
     agent: str
     code: str | None = msgspec.field(default=None, name="claim_code")
     expires_in_s: float | None = None
+    protocol: VersionRange = VersionRange()
+    capabilities: Capabilities = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,14 +87,22 @@ class CloudClient:
         self._http = Session()
 
     def enroll(self, *, name: str, software: str, transport: str, devices: list[dict[str, str]]) -> Claim:
-        """Register the agent, its devices and its transport. Idempotent."""
-        body = {"name": name, "software": software, "transport": transport, "devices": devices}
+        """Register the agent, its devices and its transport. Idempotent.
+
+        Raises:
+            CloudError: Also ``protocol-unsupported``: no common version of the wire contract.
+        """
+        body: dict[str, Any] = {"name": name, "software": software, "transport": transport, "devices": devices}
         body["public_key"] = signing.public_text(self._key.public_key())
+        body |= {"protocol": msgspec.to_builtins(PROTOCOL), "capabilities": KINDS}
         response = self._call("POST", "/agents/enroll", json=body)
         try:
-            return msgspec.convert(response, Claim)
+            claim = msgspec.convert(response, Claim)
         except msgspec.ValidationError as error:
             raise CloudError(f"the cloud's response to the enrollment is invalid: {error}") from error
+        if problem := incompatibility(agent=PROTOCOL, server=claim.protocol):
+            raise CloudError(problem, "protocol-unsupported")
+        return claim
 
     def enrollment(self, *, wait_s: float = 0.0, within_s: float = _TIMEOUT_S) -> dict[str, Any]:
         """State of the enrollment: ``state``, ``space``, ``account``, ``keys``.

@@ -17,7 +17,7 @@ from typing import TypeVar
 
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.protocol import Ack, Presence, codec, topics
+from device_agent.protocol import KINDS, PROTOCOL, Ack, Presence, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.transports.backoff import BackOff
 from device_agent.transports.http.client import RESPONSE_TIMEOUT_S, CloudClient, CloudError, QueuedCommand
@@ -340,4 +340,13 @@ class HttpTransport:
             self._process_results((*batch, last), self._send_api.send(self._agent, payloads, within_s=_DISCONNECT_S))
 
     def _presence(self, *, online: bool) -> bytes:
-        return codec.encode(Presence(online=online, session=self._session, at_ms=wall_ms(), software=self._software))
+        return codec.encode(
+            Presence(
+                online=online,
+                session=self._session,
+                at_ms=wall_ms(),
+                software=self._software,
+                protocol=PROTOCOL,
+                capabilities=KINDS,
+            )
+        )

@@ -16,7 +16,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.protocol import Presence, codec, topics
+from device_agent.protocol import KINDS, PROTOCOL, Presence, codec, topics
 from device_agent.transports import tls
 from device_agent.transports.backoff import BackOff
 from device_agent.transports.http.client import CloudClient
@@ -334,7 +334,16 @@ class MqttTransport:
             self._version = MQTTProtocolVersion.MQTTv311
 
     def _presence(self, *, online: bool) -> bytes:
-        return codec.encode(Presence(online=online, session=self._session, at_ms=wall_ms(), software=self._software))
+        return codec.encode(
+            Presence(
+                online=online,
+                session=self._session,
+                at_ms=wall_ms(),
+                software=self._software,
+                protocol=PROTOCOL,
+                capabilities=KINDS,
+            )
+        )
 
 
 class _Renewal:

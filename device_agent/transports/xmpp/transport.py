@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element
 
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.protocol import Presence, codec
+from device_agent.protocol import KINDS, PROTOCOL, Presence, codec
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.xmpp import stanzas
 from device_agent.protocol.xmpp.stream import Login, Stream, StreamError
@@ -183,7 +183,16 @@ class XmppTransport:
         return link.up
 
     def _presence(self, link: "_Link", *, online: bool) -> bytes:
-        return codec.encode(Presence(online=online, session=link.session, at_ms=wall_ms(), software=self._software))
+        return codec.encode(
+            Presence(
+                online=online,
+                session=link.session,
+                at_ms=wall_ms(),
+                software=self._software,
+                protocol=PROTOCOL,
+                capabilities=KINDS,
+            )
+        )
 
 
 class _Link:

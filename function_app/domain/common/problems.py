@@ -74,3 +74,8 @@ def store_unavailable(detail: str) -> Problem:
 def invalid_cursor() -> Problem:
     """A cursor that does not belong to the list."""
     return invalid("The cursor is not valid for this list. Start without a cursor.", code="cursor-invalid")
+
+
+def protocol_unsupported(detail: str) -> Problem:
+    """``protocol-unsupported``: the agent and the server have no common version of the wire contract."""
+    return Problem("protocol-unsupported", 409, "No common protocol version", detail)

@@ -179,6 +179,8 @@ class Link:
         seen_ms: When the cloud received it [ms since 1970, cloud clock].
         polled: The agent uses HTTP polling, so it sends no message when it stops.
         pairing: Pairing of the agent at that time.
+        protocol: Lowest and highest version of the wire contract that the agent supports.
+        capabilities: Kinds of request that the agent accepts; empty: not reported.
     """
 
     online: bool
@@ -186,6 +188,8 @@ class Link:
     seen_ms: int
     polled: bool = False
     pairing: str = ""
+    protocol: tuple[int, int] = (1, 1)
+    capabilities: tuple[str, ...] = ()
 
 
 def newer_link(existing: Link | None, incoming: Link) -> Link | None:
@@ -230,4 +234,5 @@ def polled(existing: Link | None, now_ms: int, pairing: str) -> Link | None:
     recent = existing is not None and now_ms - existing.seen_ms < POLL_MARK_MS and existing.pairing == pairing
     if existing is not None and existing.online and existing.polled and recent:
         return None
-    return Link(online=True, session=existing.session if existing else 0, seen_ms=now_ms, polled=True, pairing=pairing)
+    link = existing or Link(online=True, session=0, seen_ms=now_ms)
+    return replace(link, online=True, seen_ms=now_ms, polled=True, pairing=pairing)

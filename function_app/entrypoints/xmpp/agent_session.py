@@ -5,6 +5,8 @@ import contextlib
 import logging
 from collections.abc import Callable, Sequence
 
+import msgspec
+
 from device_agent.protocol import Presence, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.xmpp import stanzas
@@ -147,12 +149,8 @@ class AgentSession:
             if None in batch:
                 if self._replaced or await self._has_newer_session():
                     return
-                offline = Presence(
-                    online=False,
-                    session=self.presence.session,
-                    at_ms=self._functions.clock.now_ms(),
-                    software=self.presence.software,
-                )
+                at_ms = self._functions.clock.now_ms()
+                offline = msgspec.structs.replace(self.presence, online=False, at_ms=at_ms)
                 await self._store([Delivery(topics.conn(self.agent.space or "", self.agent.id), codec.encode(offline))])
                 return
 

@@ -1,7 +1,7 @@
 """The request to start an action, as the HTTP API accepts it."""
 
 import hashlib
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 
 import msgspec
 from msgspec import Meta, Struct
@@ -16,6 +16,28 @@ class AskMovement(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True,
     parameters: dict[str, Any] = {}
 
 
+def _strict(kind: type[Struct]) -> type[Struct]:
+    """The kind of task as the API accepts it: agents ignore unknown fields, the API rejects misspelled ones."""
+    strict = msgspec.defstruct(
+        kind.__name__,
+        (),
+        bases=(kind,),
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+        tag_field="kind",
+        tag=kind.__struct_config__.tag,
+    )
+    strict.__doc__ = kind.__doc__
+    return strict
+
+
+if TYPE_CHECKING:
+    _StrictTask = Task
+else:
+    _StrictTask = Union[tuple(map(_strict, get_args(Task)))]  # noqa: UP007 (of a computed tuple)
+
+
 class ActionOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What to run, and how long the action may wait and run.
 
@@ -23,7 +45,7 @@ class ActionOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     ``ttl_ms`` and ``timeout_ms`` count from the moment the action leaves the queue.
     """
 
-    request: AskMovement | Task
+    request: AskMovement | _StrictTask
     policy: Literal["reject", "queue"] = "reject"
     queue_ms: Annotated[int, Meta(ge=1_000, le=86_400_000)] = 300_000
     ttl_ms: Annotated[int, Meta(ge=1, le=86_400_000)] = 10_000

@@ -139,6 +139,10 @@ class StartAction:
         require_online(link, now_ms)
         action_id = command_id(device.id, now_ms)
         task, stored_request, pinned = await self._task(device, request)
+        kind = str(type(task).__struct_config__.tag)
+        if link is not None and link.capabilities and kind not in link.capabilities:
+            detail = f"The device's agent does not support the request '{kind}'. Update the agent."
+            raise Problem("unable", 422, "The device cannot do this", detail)
         # Validated before any write: a command that cannot be sent must not occupy the slot.
         command = self._command_sender.validated(device, action_id, task, caller=caller.name)
         draft = Action(

@@ -5,9 +5,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from device_agent.protocol import topics
+from device_agent.protocol import PROTOCOL, VersionRange, incompatibility, topics
 from function_app.domain.common.ids import device_id, split_device
-from function_app.domain.common.problems import Problem, forbidden, not_found
+from function_app.domain.common.problems import Problem, forbidden, not_found, protocol_unsupported
 from function_app.domain.control.lease import Lease
 from function_app.domain.devices import access, devices
 from function_app.domain.devices.access import OWNER_PERMISSIONS, Permissions, Share, device_target, space_target
@@ -35,6 +35,7 @@ class DeviceView:
     last_seen_ms: int | None
     state: dict[str, Any] | None
     lease: Lease | None
+    incompatible: str = ""
 
 
 class DeviceAccess:
@@ -241,6 +242,7 @@ class DeviceAccess:
                     last_seen_ms=last_seen_ms or None,
                     state=last.state if last else None,
                     lease=lease if lease and lease.is_live(now_ms) and not _ended(lease, last) else None,
+                    incompatible=incompatible(link),
                 )
             )
         return views
@@ -268,8 +270,22 @@ def require_claimed(agent: Agent) -> str:
     return agent.space
 
 
+def incompatible(link: Link | None) -> str:
+    """Why the agent and this server cannot work together; empty if they can."""
+    if link is None or link.protocol == (PROTOCOL.min, PROTOCOL.max):
+        return ""
+    lowest, highest = link.protocol
+    return incompatibility(agent=VersionRange(min=lowest, max=highest), server=PROTOCOL)
+
+
 def require_online(link: Link | None, now_ms: int) -> None:
-    """Reject commands to a device whose agent reported "offline" or stopped polling: ``device-offline``."""
+    """Reject commands to a device whose agent is offline (``device-offline``) or too old or new.
+
+    Raises:
+        Problem: ``device-offline``: the agent reported "offline" or stopped polling; ``protocol-unsupported``.
+    """
+    if problem := incompatible(link):
+        raise protocol_unsupported(problem)
     if link is not None and not (devices.online(link, link.seen_ms, now_ms) if link.polled else link.online):
         detail = "The device's agent is offline. Check that it is running and connected."
         raise Problem("device-offline", 409, "The device is offline", detail)

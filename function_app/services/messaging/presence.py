@@ -69,7 +69,15 @@ class PresenceIngest:
         now_ms = self._clock.now_ms()
         if topic.kind == topics.CONN:
             presence = codec.decode(payload, Presence)
-            link = Link(presence.online, presence.session, now_ms, by == "http", agent.pairing)
+            link = Link(
+                online=presence.online,
+                session=presence.session,
+                seen_ms=now_ms,
+                polled=by == "http",
+                pairing=agent.pairing,
+                protocol=(presence.protocol.min, presence.protocol.max),
+                capabilities=presence.capabilities,
+            )
             if link.online:
                 await self._reported_faults.on_connected(agent, link.session)
             await records.upsert(

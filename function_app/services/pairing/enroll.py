@@ -3,9 +3,10 @@
 import asyncio
 from dataclasses import dataclass, replace
 
+from device_agent.protocol import PROTOCOL, VersionRange, incompatibility
 from function_app.domain.common.ids import new_claim_code
-from function_app.domain.common.problems import Problem
-from function_app.domain.devices.devices import Agent, DeviceSpec, Transport, with_devices
+from function_app.domain.common.problems import Problem, protocol_unsupported
+from function_app.domain.devices.devices import Agent, DeviceSpec, Link, Transport, with_devices
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.pairing.offboarding import Offboarding
@@ -27,6 +28,8 @@ class Enrollment:
     software: str
     devices: tuple[DeviceSpec, ...]
     transport: Transport = "mqtt"
+    protocol: VersionRange = PROTOCOL
+    capabilities: tuple[str, ...] = ()
 
 
 class Enroll:
@@ -44,8 +47,11 @@ class Enroll:
         Actions of removed devices end. The row of the code is written first; it has no effect without the agent's row.
 
         Raises:
-            Problem: ``agent-id-taken``: another key has the same id (one in 2⁵⁰).
+            Problem: ``agent-id-taken``: another key has the same id (one in 2⁵⁰); ``protocol-unsupported``.
         """
+        if problem := incompatibility(agent=enrollment.protocol, server=PROTOCOL):
+            await self._mark_incompatible(agent, enrollment)
+            raise protocol_unsupported(problem)
 
         async def attempt() -> Agent:
             row = await self._tables.get(records.AGENTS, agent, "agent")
@@ -81,6 +87,27 @@ class Enroll:
         if record.claimed and record.leaving:
             await self._offboarding.finish(agent)
         return record
+
+    async def _mark_incompatible(self, agent_id: str, enrollment: Enrollment) -> None:
+        """Store for the owner that the agent is not connected, and which versions it supports."""
+        _, agent = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
+        if agent is None or not agent.claimed or agent.public_key != enrollment.public_key:
+            return
+        now_ms, pairing = self._clock.now_ms(), agent.pairing
+        versions = (enrollment.protocol.min, enrollment.protocol.max)
+
+        def mark(existing: Link | None) -> Link:
+            link = existing or Link(online=False, session=0, seen_ms=now_ms)
+            return replace(
+                link,
+                online=False,
+                seen_ms=now_ms,
+                pairing=pairing,
+                protocol=versions,
+                capabilities=enrollment.capabilities,
+            )
+
+        await records.upsert(self._tables, records.AGENTS, agent_id, "link", mark, Link)
 
     async def wait(self, agent: Agent, wait_ms: int) -> Agent:
         """The agent, as soon as it is claimed, or after the time limit."""

@@ -6,7 +6,9 @@ import { bytes, description, state, telemetry, twin } from "../support/messages"
 describe("messages from a robot", () => {
   it("are read with defaults for absent fields and without unknown fields", () => {
     expect(readTelemetry(bytes(telemetry({ epoch: undefined })))).toMatchObject({ frames: [], epoch: 0, setpoint_sequence: 0, limited: [] });
-    expect(readPresence(bytes({ online: true, session: 4, at_ms: 5, mood: "good" }))).toEqual({ online: true, session: 4, at_ms: 5, software: "" });
+    expect(readPresence(bytes({ online: true, session: 4, at_ms: 5, mood: "good" }))).toEqual({
+      online: true, session: 4, at_ms: 5, software: "", protocol: { min: 1, max: 1 }, capabilities: [],
+    });
     expect(readState(bytes(state(0))).stop).toBeNull();
     expect(readDescription(bytes(description)).joints).toHaveLength(6);
     expect(readTwin(bytes(twin)).bodies.length).toBeGreaterThan(6);

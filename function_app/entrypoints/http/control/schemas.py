@@ -5,7 +5,15 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from device_agent.protocol import Id
-from function_app.entrypoints.http.framework.schemas import Epoch, LeaseMs, Moment, Request, Response, WaitMs
+from function_app.entrypoints.http.framework.schemas import (
+    AgentRequest,
+    Epoch,
+    LeaseMs,
+    Moment,
+    Request,
+    Response,
+    WaitMs,
+)
 
 WithinMs = Annotated[int, Meta(ge=1_000, le=120_000)]
 TakeoverReason = Annotated[str, Meta(max_length=200)]
@@ -110,7 +118,7 @@ class ControlCredentialsRequest(Request, frozen=True, kw_only=True, tag_field="p
     epoch: Epoch
 
 
-class AgentCredentialsRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="agent"):
+class AgentCredentialsRequest(AgentRequest, frozen=True, kw_only=True, tag_field="purpose", tag="agent"):
     """Credentials of an agent for its own devices."""
 
 

@@ -13,7 +13,10 @@ LABEL_PATTERN = r"^[^\x00-\x08\x0e-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x08\x0e-\
 
 
 class DeviceOut(Response, frozen=True, kw_only=True):
-    """A device. ``role``: the caller's role. ``state``: the newest ``state`` message of the device."""
+    """A device. ``role``: the caller's role. ``state``: the newest ``state`` message of the device.
+
+    ``incompatible``: why the agent and this server cannot work together, and which of them to update.
+    """
 
     id: str
     name: str
@@ -26,6 +29,7 @@ class DeviceOut(Response, frozen=True, kw_only=True):
     owner: AccountRef
     topic: str
     online: bool
+    incompatible: str | None
     last_seen_at: Moment | None
     state: State | None
     lease: LeaseOut | None

@@ -20,6 +20,7 @@ def device_out(view: DeviceView, caller: Identity, now_ms: int) -> DeviceOut:
         role=device.role.value,
         owner=AccountRef(id=device.owner, name=view.owner_name),
         online=view.online,
+        incompatible=view.incompatible or None,
         last_seen_at=None if view.last_seen_ms is None else rfc3339(view.last_seen_ms),
         state=None if view.state is None else msgspec.convert(view.state, State, strict=False),
         lease=lease_out(view.lease, caller, now_ms),

@@ -18,6 +18,10 @@ class Request(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base class of request bodies. Unknown fields are rejected."""
 
 
+class AgentRequest(Request, frozen=True, kw_only=True, forbid_unknown_fields=False):
+    """Base class of request bodies of agents. Unknown fields are ignored: the agent may be newer."""
+
+
 class Response(Struct, frozen=True, kw_only=True):
     """Base class of response bodies."""
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Raw
 
 from function_app.entrypoints.http.control.schemas import AgentCredentialsRequest, ViewCredentialsRequest
-from function_app.entrypoints.http.framework.schemas import Moment, Request, Response
+from function_app.entrypoints.http.framework.schemas import AgentRequest, Moment, Request, Response
 
 
 class CommandOut(Response, frozen=True, kw_only=True):
@@ -23,14 +23,14 @@ class CommandList(Response, frozen=True, kw_only=True):
     items: tuple[CommandOut, ...]
 
 
-class AgentMessage(Request, frozen=True, kw_only=True):
+class AgentMessage(AgentRequest, frozen=True, kw_only=True):
     """One message, with topic and payload as in MQTT."""
 
     topic: Annotated[str, Meta(min_length=1, max_length=400)]
     payload: Raw
 
 
-class MessagesRequest(Request, frozen=True, kw_only=True):
+class MessagesRequest(AgentRequest, frozen=True, kw_only=True):
     """Messages in the order in which they were created."""
 
     messages: Annotated[tuple[AgentMessage, ...], Meta(min_length=1, max_length=500)]

@@ -45,7 +45,15 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             raise invalid("Two devices have the same name.")
         agent = await auth.enrolling(request, payload.public_key)
         specs = tuple(msgspec.convert(device, DeviceSpec, from_attributes=True) for device in payload.devices)
-        enrollment = Enrollment(payload.name, payload.public_key, payload.software, specs, payload.transport)
+        enrollment = Enrollment(
+            payload.name,
+            payload.public_key,
+            payload.software,
+            specs,
+            payload.transport,
+            payload.protocol,
+            payload.capabilities,
+        )
         done = await functions.enroll.enroll(agent, enrollment)
         if done.claimed:
             return json_response(schemas.EnrollmentOut(agent=done.id, claim_code=None, expires_at=None, expires_in_s=0))

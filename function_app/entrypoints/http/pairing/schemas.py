@@ -4,12 +4,20 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from device_agent.protocol import Id, Label
+from device_agent.protocol import KINDS, PROTOCOL, Capabilities, Id, Label, VersionRange
 from function_app.entrypoints.http.devices.schemas import DeviceOut
-from function_app.entrypoints.http.framework.schemas import AccountRef, DeviceName, Moment, Name, Request, Response
+from function_app.entrypoints.http.framework.schemas import (
+    AccountRef,
+    AgentRequest,
+    DeviceName,
+    Moment,
+    Name,
+    Request,
+    Response,
+)
 
 
-class DeviceIn(Request, frozen=True, kw_only=True):
+class DeviceIn(AgentRequest, frozen=True, kw_only=True):
     """One device behind an agent."""
 
     name: DeviceName
@@ -18,8 +26,11 @@ class DeviceIn(Request, frozen=True, kw_only=True):
     label: Label
 
 
-class EnrollRequest(Request, frozen=True, kw_only=True):
-    """An agent with its devices. ``public_key`` must verify the bearer token."""
+class EnrollRequest(AgentRequest, frozen=True, kw_only=True):
+    """An agent with its devices. ``public_key`` must verify the bearer token.
+
+    ``protocol``: versions of the wire contract that it supports. ``capabilities``: kinds of request that it accepts.
+    """
 
     name: Name
     public_key: Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{43}$")]
@@ -29,15 +40,23 @@ class EnrollRequest(Request, frozen=True, kw_only=True):
         Literal["mqtt", "http", "xmpp"],
         Meta(description="How the agent receives commands: MQTT broker, HTTP polling or XMPP"),
     ] = "mqtt"
+    protocol: VersionRange = VersionRange()
+    capabilities: Capabilities = ()
 
 
 class EnrollmentOut(Response, frozen=True, kw_only=True):
-    """An enrolled agent. ``claim_code`` is null if the agent is claimed."""
+    """An enrolled agent. ``claim_code`` is null if the agent is claimed.
+
+    ``protocol``: versions that the server supports; the highest common one is used. ``capabilities``: kinds of request
+    that the server can send.
+    """
 
     agent: str
     claim_code: str | None
     expires_at: Moment | None
     expires_in_s: int
+    protocol: VersionRange = PROTOCOL
+    capabilities: tuple[str, ...] = KINDS
 
 
 class SigningKeyOut(Response, frozen=True, kw_only=True):
@@ -67,7 +86,7 @@ class EnrollmentState(Response, frozen=True, kw_only=True):
     signing_key: str
 
 
-class CertificateRequest(Request, frozen=True, kw_only=True):
+class CertificateRequest(AgentRequest, frozen=True, kw_only=True):
     """A certificate signing request (PKCS #10 in PEM) for a P-256 key."""
 
     request: Annotated[str, Meta(min_length=1, max_length=4096)]

@@ -198,6 +198,11 @@ function Heading({ api, device, fleet }: { api: Api; device: DeviceStore; fleet:
           {texts.cards.access}
         </button>
       </p>
+      {info.incompatible !== null && (
+        <p class="notice warn" data-testid="incompatible">
+          {info.incompatible}
+        </p>
+      )}
       {parseError !== null && <p class="notice warn">{texts.device.unreadable(parseError)}</p>}
     </div>
   );

@@ -67,6 +67,11 @@ function DevicePage({ api, fleet, account, device, page, children }: FramedProps
             ))}
           </nav>
         </div>
+        {device.info.value.incompatible !== null && (
+          <p class="notice warn" data-testid="incompatible">
+            {device.info.value.incompatible}
+          </p>
+        )}
         <StopBanner device={device} stop={session.stop} />
         {children(session)}
       </main>

@@ -6,6 +6,8 @@ import { texts } from "./texts";
 /** Why the device is unavailable, or "". */
 export function unavailableReason(device: DeviceStore): string {
   if (device.info.value.role === "viewer") return texts.unavailable.viewer;
+  const { incompatible } = device.info.value;
+  if (incompatible !== null) return incompatible;
   if (device.reach.value === "offline" || device.reach.value === "unknown") return texts.unavailable.offline;
   if (device.stopped.value) return texts.unavailable.stopped;
   return "";

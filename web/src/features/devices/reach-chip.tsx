@@ -9,7 +9,7 @@ import { texts } from "./texts";
 export function ReachChip({ device, ...rest }: { device: DeviceStore; "data-testid"?: string }) {
   const reach = device.reach.value;
   return (
-    <span class={`chip reach-${reach}`} data-status={reach} title={texts.reachExplained[reach]} {...rest}>
+    <span class={`chip reach-${reach}`} data-status={reach} title={device.info.value.incompatible ?? texts.reachExplained[reach]} {...rest}>
       <span class="dot" aria-hidden="true" />
       {texts.reach[reach]}
     </span>

@@ -72,6 +72,8 @@ export interface Device {
   owner: Person;
   topic: string;
   online: boolean;
+  /** Why the agent and the server cannot work together, and which of them to update. */
+  incompatible: string | null;
   last_seen_at: string | null;
   lease: Lease | null;
 }

@@ -10,7 +10,7 @@ import type { Pose, Quaternion, Vector3 } from "../lib/vectors";
 import type {
   Ack, AckStatus, ActionState, BaseLimits, Body, Control, Description, Diagnostic, Event, Fault, Geometry,
   InterlockDescription, Joint, JointTelemetry, LeaseState, Measurements, MimicJoint, Mode, PositionDependentLimit,
-  OpenRequest, Presence, Reason, Restriction, State, StopLatch, Stream, TwinJoint,
+  OpenRequest, Presence, Reason, Restriction, State, StopLatch, Stream, TwinJoint, VersionRange,
 } from "./protocol.generated";
 
 /** Largest message of the contract [bytes]. */
@@ -30,6 +30,8 @@ const presence = object<Required<Presence>>({
   session: count,
   at_ms: count,
   software: optional(text, ""),
+  protocol: optional(object<Required<VersionRange>>({ min: optional(count, 1), max: optional(count, 1) }), { min: 1, max: 1 }),
+  capabilities: optional(list(text, MAX_JOINTS), []),
 });
 
 const joint = object<Joint>({

@@ -5,6 +5,10 @@
  * `conn`: whether the agent is connected to the broker. Retained, and the MQTT will.
  *
  * `session` rises with each connection. Readers ignore `online=False` with a lower session than the newest one.
+ *
+ * Attributes:
+ * protocol: Versions of the wire contract that the agent supports.
+ * capabilities: Kinds of request that the agent accepts; empty: not reported.
  */
 export interface Presence {
   online: boolean;
@@ -12,6 +16,15 @@ export interface Presence {
   at_ms: number;
   /** no control and format characters */
   software?: string;
+  protocol?: VersionRange;
+  /** kinds of request */
+  capabilities?: string[];
+}
+
+/** All versions from `min` to `max`. Programs that report no range support version 1. */
+export interface VersionRange {
+  min?: number;
+  max?: number;
 }
 
 /**

@@ -160,6 +160,7 @@ def test_an_epoch_that_is_not_the_callers_starts_nothing(cloud: Cloud, anna: Per
         (MOVE | {"speed": 0}, 422, "invalid"),
         (MOVE | {"speed": 1.01}, 422, "invalid"),
         (MOVE | {"speed": -1}, 422, "invalid"),
+        (MOVE | {"sped": 0.5}, 422, "invalid"),
         ({"kind": "run_movement", "name": "wave", "parameters": {"text": "x" * 140_000}}, 422, "parameters-invalid"),
         ({"kind": "run_movement", "name": "wave", "parameters": {"times": 21}}, 422, "parameters-invalid"),
         ({"kind": "run_movement", "name": "wave", "source": "print(1)"}, 422, "invalid"),

@@ -88,7 +88,8 @@ class TestEnroll:
                 {"devices": [{"name": name, "kind": "arm", "robot_type": "ur5", "label": ""} for name in names]}
                 for names in ([], ["a", "a"], ["a/b"], ["x" * 33], [f"d{number}" for number in range(65)])
             ),
-            {"name": ""}, {"public_key": "x"}, {"public_key": "!" * 43}, {"software": "x" * 201}, {"space": "mine"},
+            {"name": ""}, {"public_key": "x"}, {"public_key": "!" * 43}, {"software": "x" * 201},
+            {"protocol": {"min": 2, "max": 1}},
         ],
         ids=lambda changes: str(changes)[:50],
     )  # fmt: skip

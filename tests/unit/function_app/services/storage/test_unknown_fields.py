@@ -29,7 +29,7 @@ def test_a_change_keeps_the_fields_and_the_version_of_a_newer_server(
 ) -> None:
     use(cloud, anna, robot, "first")
     before = {(table, row.partition, row.key): row for table, row in memory.tables.rows()}
-    for (table, partition), stored in memory.tables._partitions.items():
+    for stored in memory.tables._partitions.values():
         for key, (etag, text) in stored.rows.items():
             newer = {**json.loads(text), "later": LATER, "~schema": NEWER}
             stored.rows[key] = (etag, json.dumps(newer).encode())
