@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from device_agent.protocol.security import private_folder
 from function_app.entrypoints.cli import accounts, audit, keys, server
-from function_app.entrypoints.hosts.uvicorn import PortTaken
+from function_app.entrypoints.hosts.port_taken import PortTaken
 from function_app.ports.model_compiler import CompilerMissingError
 from function_app.ports.tables import StoreError
 from function_app.settings import SettingsError

@@ -10,6 +10,15 @@ _CONTAINER = re.compile(r"\A(?=.{3,63}\Z)[a-z0-9]+(-[a-z0-9]+)*\Z")
 _TABLE = re.compile(r"\A[A-Za-z0-9_.-]{3,255}\Z")
 _BUCKET = re.compile(r"\A(?=.{3,63}\Z)[a-z0-9][a-z0-9.-]*[a-z0-9]\Z")
 _SECRET = re.compile(r"\A[A-Za-z0-9-]{1,127}\Z")
+_AZURITE_KEY = (
+    "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/"  # pragma: allowlist secret
+    "K1SZFPTOtr/KBHBeksoGMGw=="  # pragma: allowlist secret
+)
+_AZURITE = (
+    f"DefaultEndpointsProtocol=http;AccountName=devstoreaccount1;AccountKey={_AZURITE_KEY};"
+    "BlobEndpoint=http://127.0.0.1:10000/devstoreaccount1;TableEndpoint=http://127.0.0.1:10002/devstoreaccount1"
+)
+"""Connection string of Azurite with its default ports and its well-known account."""
 _KMS_KEY = re.compile(r"\A[A-Za-z0-9:/_-]{0,256}\Z")
 
 
@@ -128,6 +137,8 @@ def _read_azure(env: Environment) -> AzureStore:
         "TELESCOPE_STORAGE_CONTAINER", "telescope", _CONTAINER, "3 to 63 lower-case letters, digits and hyphens"
     )
     connection = env.get("TELESCOPE_STORAGE_CONNECTION", "")
+    if connection == "UseDevelopmentStorage=true":
+        connection = _AZURITE  # the SDKs for Python do not know the short form
     if connection:
         # Never in an error message: it contains a key.
         if not all("=" in part for part in connection.strip("; ").split(";")):

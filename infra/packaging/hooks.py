@@ -27,15 +27,14 @@ class DependencyGroups(MetadataHookInterface):
 
 
 class Console(BuildHookInterface[Any]):
-    """Includes ``web/dist``; without it the server answers the console's address with instructions."""
+    """Includes ``web/dist``. Without it the build fails, except an editable installation."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Adds the folder to the files of the wheel."""
-        del version
-        if _CONSOLE.is_dir():
+        if (_CONSOLE / "index.html").is_file():
             build_data["force_include"][str(_CONSOLE)] = "function_app/console"
-        else:
-            self.app.display_warning("The console is not built: run `make wheels` to include it.")
+        elif version != "editable":
+            raise SystemExit("telescope: the console is not built; run `make console` first")
 
 
 def _packages(groups: dict[str, list[Any]], names: list[str]) -> list[str]:

@@ -1,6 +1,7 @@
 """The released agent works with this server, this agent with the released server, and both servers on one store."""
 
 import contextlib
+import functools
 import json
 import os
 import shutil
@@ -35,7 +36,7 @@ class Versions:
         brokers = {version: self._broker(version, folder / f"{version}.json") for version in self.trees}
         self.people = {version: self._serve(version, broker) for version, broker in brokers.items()}
         for person in self.people.values():
-            wait_until(lambda person=person: _answers(person), "the server")
+            wait_until(functools.partial(_answers, person), "the server")
         signed_in = self.people["released"].post("/auth/sign-in", json={"link": link}).json()
         for person in self.people.values():
             person.headers["Authorization"] = f"Bearer {signed_in['access_token']}"

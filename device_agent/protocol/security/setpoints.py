@@ -26,7 +26,7 @@ _TAG_DIGITS = 32
 _P = 2**255 - 19
 
 
-class Tagged(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Tagged(Struct, frozen=True, kw_only=True):
     """``ctl/{epoch}`` on the wire: ``body`` is a ``Setpoint``, ``tag`` its HMAC in hexadecimal."""
 
     tag: str

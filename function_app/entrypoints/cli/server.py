@@ -9,7 +9,7 @@ from function_app import settings
 from function_app.adapters import factory
 from function_app.bootstrap import Functions
 from function_app.entrypoints.cli import build, with_functions
-from function_app.entrypoints.hosts import uvicorn, worker
+from function_app.entrypoints.hosts import worker
 from function_app.settings import SettingsError
 
 _WORKER_NICE = 5
@@ -32,6 +32,8 @@ def add_commands(commands: Any) -> None:
 
 
 def _serve(_: argparse.Namespace) -> int:
+    from function_app.entrypoints.hosts import uvicorn  # noqa: PLC0415 (cloud packages do not contain it)
+
     functions = build()
     asyncio.run(_check(functions))
     uvicorn.serve(functions)

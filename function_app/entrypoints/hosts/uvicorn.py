@@ -18,6 +18,7 @@ from function_app.entrypoints.hosts.connection_limits import (
 )
 from function_app.entrypoints.hosts.http_connection import HEADERS_S, HttpConnection, RequestLimits
 from function_app.entrypoints.hosts.http_host import ALL_ADDRESSES, AllowedHosts
+from function_app.entrypoints.hosts.port_taken import PortTaken
 from function_app.entrypoints.http import create_app
 from function_app.settings import Settings
 
@@ -29,10 +30,6 @@ _RESERVED_SHARE = 8
 """One in this number of connections is reserved for Stop."""
 _TICKS_PER_CHECK = 5
 """Deadlines are checked twice per second."""
-
-
-class PortTaken(Exception):  # noqa: N818 (a message for the terminal)
-    """Another program uses the address."""
 
 
 def serve(functions: Functions) -> None:

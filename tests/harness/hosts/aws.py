@@ -6,11 +6,15 @@ requests start further instances.
 
 import base64
 import contextlib
+import importlib.metadata
 import json
 import os
 import queue
 import re
 import signal
+import subprocess
+import sys
+import tempfile
 import threading
 import time
 import uuid
@@ -19,7 +23,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 from urllib.parse import unquote_to_bytes
 
-from tests.harness.hosts.host import PATIENCE_S, HostFailed, Program, environment_of, isolated_path, start_program
+from tests.harness.hosts.host import PATIENCE_S, HostFailed, Program, environment_of, start_program
 from tests.harness.network.http_server import QuietHandler, serve
 from tests.harness.paths import ROOT
 
@@ -34,35 +38,49 @@ _ARN = "arn:aws:lambda:eu-west-1:123456789012:function:telescope"
 
 @contextlib.contextmanager
 def start_lambda(
-    environment: Mapping[str, str], *, freeze: bool = True, package: Path | None = None
+    environment: Mapping[str, str], *, freeze: bool = True, package: Path | None = None, python: str = sys.executable
 ) -> Iterator["Lambda"]:
     """Start the functions behind a gateway on a free port; ``package``: use only the code and libraries in it."""
     with contextlib.ExitStack() as stack:
         instances = stack.enter_context(contextlib.ExitStack())
-        host = Lambda(environment, instances, freeze=freeze, package=package)
+        host = Lambda(environment, instances, freeze=freeze, package=package, python=python)
         host.url = stack.enter_context(serve(_gateway(host)))
         stack.callback(host.thaw)
         yield host
+
+
+def _runtime_client(package: Path, python: str) -> Path:
+    """Amazon's runtime client for an interpreter: Lambda provides it, so it is not in the package."""
+    folder = Path(tempfile.mkdtemp(dir=package.parent))
+    pin = f"awslambdaric=={importlib.metadata.version('awslambdaric')}"
+    command = [sys.executable, "-m", "uv", "pip", "install", "--quiet", "--python", python, "--target", str(folder)]
+    subprocess.run([*command, pin], check=True)
+    return folder
 
 
 class Lambda:
     """The service: starts instances and sends events to them."""
 
     def __init__(
-        self, environment: Mapping[str, str], stack: contextlib.ExitStack, *, freeze: bool, package: Path | None
+        self,
+        environment: Mapping[str, str],
+        stack: contextlib.ExitStack,
+        *,
+        freeze: bool,
+        package: Path | None,
+        python: str,
     ) -> None:
         self.url = ""
         self.instances: list[_Instance] = []
         self._environment = environment
         self._stack = stack
         self._freeze = freeze
+        self._python = python
         self._folder, self._arguments = ROOT, ["-m", "awslambdaric", _HANDLER]
         self._libraries: dict[str, str] = {}
         if package is not None:
             self._folder, self._arguments = package, ["-S", *self._arguments]
-            self._libraries = isolated_path(
-                package, "awslambdaric", "runtime_client*", "simplejson", "snapshot_restore_py"
-            )
+            self._libraries = {"PYTHONPATH": f"{package}{os.pathsep}{_runtime_client(package, python)}"}
         self._lock = threading.Lock()
         self._idle: list[_Instance] = []
 
@@ -120,7 +138,9 @@ class Lambda:
                 **self._libraries,
             }
         )
-        instance.program = self._stack.enter_context(start_program(self._arguments, settings, folder=self._folder))
+        instance.program = self._stack.enter_context(
+            start_program(self._arguments, settings, folder=self._folder, python=self._python)
+        )
         self.instances.append(instance)
         return instance
 

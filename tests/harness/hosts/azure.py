@@ -18,13 +18,15 @@ WORKER = Path(sys.prefix) / "azure-worker"
 
 
 @contextlib.contextmanager
-def start_azure(environment: Mapping[str, str], *, package: Path | None = None) -> Iterator[Host]:
+def start_azure(
+    environment: Mapping[str, str], *, package: Path | None = None, python: str = sys.executable
+) -> Iterator[Host]:
     """Start the worker on a free port and load the functions; ``package``: use only the libraries in it."""
     assert any(WORKER.glob("azure_functions_runtime")), f"the Functions worker is not in {WORKER}; run `make test`"
     arguments, more = ["-m", "tests.harness.hosts.functions_host", str(WORKER)], {}
     if package is not None:
         arguments, more = ["-S", *arguments], isolated_path(package, "uvicorn", "h11", "click")
-    with start_program(arguments, environment_of({**environment, **more})) as program:
+    with start_program(arguments, environment_of({**environment, **more}), python=python) as program:
         yield _Azure(program.read_line())
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import select
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -11,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Protocol
 
+from infra.function_package import PYTHON
 from tests.harness.paths import ROOT
 
 LOOPBACK = "127.0.0.1"
@@ -55,12 +57,12 @@ def environment_of(environment: Mapping[str, str]) -> dict[str, str]:
 
 @contextlib.contextmanager
 def start_program(
-    arguments: Sequence[str], environment: Mapping[str, str], *, folder: Path = ROOT
+    arguments: Sequence[str], environment: Mapping[str, str], *, folder: Path = ROOT, python: str = sys.executable
 ) -> Iterator["Program"]:
     """Run a Python program until the context exits; its standard error is available for failure messages."""
     with tempfile.TemporaryFile("w+") as stderr:
         process = subprocess.Popen(
-            [sys.executable, *arguments],
+            [python, *arguments],
             cwd=folder,
             env=dict(environment),
             stdin=subprocess.PIPE,
@@ -73,6 +75,17 @@ def start_program(
             yield program
         finally:
             program.end()
+
+
+def cloud_python(cloud: str) -> str:
+    """The interpreter of the version that a cloud runs, if this machine has it; otherwise this one."""
+    version = PYTHON[cloud]
+    installed = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
+    for candidate in (shutil.which(f"python{version}"), *installed.glob(f"{version}.*/bin/python")):
+        # A shim of pyenv exists for versions that are not enabled; it fails.
+        if candidate and subprocess.run([candidate, "-c", ""], capture_output=True, check=False).returncode == 0:
+            return str(candidate)
+    return sys.executable
 
 
 def isolated_path(package: Path, *programs: str) -> dict[str, str]:
