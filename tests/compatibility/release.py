@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tests.harness.paths import ROOT
 
-RELEASE = "23ca657044ef5c2877ae04d71bf47d275d2816bf"
+RELEASE = "190440b7e323db07d6e2a2f5133282d26e63dfad"
 """Commit of the newest release: an ancestor of this one. Set it to the released commit after each release."""
 PARTS = ("function_app", "device_agent", "infra", "robots")
 
