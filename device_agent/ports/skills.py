@@ -11,10 +11,6 @@ from typing import Protocol, runtime_checkable
 
 from device_agent.protocol import Express, LookAt, RunBehaviour, Say, SetStiffness, TakePosture
 
-SPEECH, STIFFNESS, GAZE, EXPRESSIONS, BEHAVIOURS = "speech", "stiffness", "gaze", "expressions", "behaviours"
-POSTURES = "postures"
-"""Capabilities of manifests; each has a skill below."""
-
 
 class SkillError(Exception):
     """The skill failed. The message is shown to operators and lists the known names if a name was unknown."""

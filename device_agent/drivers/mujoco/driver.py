@@ -14,11 +14,11 @@ from device_agent.drivers.mujoco.cameras import RobotCameras
 from device_agent.drivers.mujoco.fault_injection import NO_FAULTS, FaultInjector, InjectedFaults, MotorFault
 from device_agent.drivers.mujoco.motor_model import HEALTH, MotorModel
 from device_agent.drivers.mujoco.servo_gains import ServoGains
-from device_agent.ports import skills
 from device_agent.ports.driver import DriverError, Observation, Twist
 from device_agent.ports.sensor import Frame
 from device_agent.ports.skills import Skill, SkillContext, SkillError
 from device_agent.protocol import Pose, SetStiffness, Twin
+from device_agent.protocol.manifests import task_kinds
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.simulation.mjcf import twin
 from device_agent.simulation.mjcf.equality_joints import SCALAR_JOINTS
@@ -173,7 +173,7 @@ class MujocoDriver:
         """The current image of a camera."""
         return self._cameras.frame(camera)
 
-    performs = (skills.STIFFNESS,)
+    performs = (task_kinds.STIFFNESS,)
 
     def perform(self, skill: Skill, context: SkillContext) -> None:
         """Set the stiffness of joints, from the next group of steps on.

@@ -2,30 +2,18 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import Any
 
 from msgspec import StructMeta
 
-from device_agent.ports import skills
 from device_agent.ports.driver import Observation
 from device_agent.ports.floor_map import ObstacleMap
 from device_agent.ports.geometry import RobotGeometry
 from device_agent.ports.script_calls import GetLatest, GetState, Home, Play
 from device_agent.ports.skills import Skills
-from device_agent.protocol import (
-    Drive,
-    Express,
-    GoTo,
-    LookAt,
-    MoveJoints,
-    MovePose,
-    RobotTask,
-    RunBehaviour,
-    Say,
-    SetStiffness,
-    TakePosture,
-)
+from device_agent.protocol import LookAt, MovePose, RunBehaviour, SetStiffness, TakePosture
 from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.protocol.manifests.task_kinds import tag, tasks_of
 from device_agent.runtime.actions.speech_output import SpeechOutput
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
@@ -40,8 +28,6 @@ SCRIPT_NAMES: Mapping[StructMeta, str] = {
     RunBehaviour: "behaviour",
 }
 """Methods of the script API whose name differs from the kind of their message."""
-CARTESIAN = "cartesian"
-"""Capability of a manifest in addition to those of ``ports.skills``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,25 +76,16 @@ class DeviceContext:
 
     def supported(self) -> tuple[StructMeta, ...]:
         """Types of the calls that this robot supports."""
-        kind, named = self.robot_type, set(self.robot_type.capabilities)
-        by_driver = {capability for capability in named if self.performs(capability)}
-        has: dict[StructMeta, bool] = {
-            MoveJoints: bool(kind.joints),
-            Play: bool(kind.joints),
-            Home: bool(kind.joints),
-            MovePose: CARTESIAN in named and self.geometry is not None,
-            Drive: kind.base is not None,
-            GoTo: kind.base is not None and self.obstacle_map is not None,
-            LookAt: skills.GAZE in by_driver or (kind.gaze is not None and self.geometry is not None),
-            Say: skills.SPEECH in named,
-            SetStiffness: skills.STIFFNESS in by_driver,
-            Express: skills.EXPRESSIONS in by_driver or bool(kind.expressions),
-            TakePosture: skills.POSTURES in by_driver or bool(kind.postures),
-            RunBehaviour: skills.BEHAVIOURS in by_driver or bool(kind.behaviours),
-            GetState: True,
-            GetLatest: True,
-        }
-        return tuple(call for call, available in has.items() if available)
+        joint_calls = (Play, Home) if self.robot_type.joints else ()
+        return *self._tasks(), *joint_calls, GetState, GetLatest
+
+    def _tasks(self) -> tuple[StructMeta, ...]:
+        return tasks_of(
+            self.robot_type,
+            performed=() if self.skills is None else self.skills.performs,
+            has_model=self.geometry is not None,
+            has_map=self.obstacle_map is not None,
+        )
 
     def script_calls(self) -> tuple[str, ...]:
         """Names of the script API's methods that this robot supports."""
@@ -116,18 +93,12 @@ class DeviceContext:
 
     def tasks(self) -> tuple[str, ...]:
         """Kinds of the wire contract's tasks that this robot supports."""
-        supported = self.supported()
-        return tuple(tag(task) for task in get_args(RobotTask) if task in supported)
+        return tuple(map(tag, self._tasks()))
 
     def performs(self, capability: str) -> bool:
         """Whether the driver executes this skill itself; otherwise the manifest describes it."""
         driver = self.skills
         return driver is not None and capability in self.robot_type.capabilities and capability in driver.performs
-
-
-def tag(call: StructMeta) -> str:
-    """The ``kind`` of a message type."""
-    return str(call.__struct_config__.tag)
 
 
 def by_name(robot_type: RobotType, values: Sequence[float]) -> dict[str, float]:

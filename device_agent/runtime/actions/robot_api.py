@@ -8,7 +8,8 @@ from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import GeometryError, RobotGeometry
 from device_agent.ports.script_calls import Call, GetLatest, GetState, Home, Play
 from device_agent.protocol import Drive, GoTo, LookAt, MoveJoints, MovePose, RobotTask
-from device_agent.runtime.actions.device_context import SCRIPT_NAMES, DeviceContext, by_name, tag
+from device_agent.protocol.manifests.task_kinds import tag
+from device_agent.runtime.actions.device_context import SCRIPT_NAMES, DeviceContext, by_name
 from device_agent.runtime.actions.skill_runner import SkillRunner
 from device_agent.runtime.authority.authority import Reservation
 from device_agent.runtime.control.goals import GoalResult, MotionGoal

@@ -5,9 +5,9 @@ import threading
 import time
 from typing import Protocol
 
-from device_agent.ports import skills
 from device_agent.ports.skills import Skill, SkillError
 from device_agent.protocol import Express, RunBehaviour, Say, SetStiffness, TakePosture
+from device_agent.protocol.manifests import task_kinds
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.speech_output import Utterance
 from device_agent.runtime.authority.authority import Reservation
@@ -49,14 +49,14 @@ class SkillRunner:
         """
         robot_type, by_driver = self._context.robot_type, self._context.performs
         match skill:
-            case Express(name=name, strength=strength) if not by_driver(skills.EXPRESSIONS):
+            case Express(name=name, strength=strength) if not by_driver(task_kinds.EXPRESSIONS):
                 target = named_poses.expression(robot_type, name, strength)
                 self._mover.move_joints(target, named_poses.EXPRESSION_SPEED)
-            case TakePosture(name=name, speed=speed) if not by_driver(skills.POSTURES):
+            case TakePosture(name=name, speed=speed) if not by_driver(task_kinds.POSTURES):
                 self._mover.move_joints(named_poses.posture(robot_type, name), speed)
-            case RunBehaviour(name=name) if not by_driver(skills.BEHAVIOURS):
+            case RunBehaviour(name=name) if not by_driver(task_kinds.BEHAVIOURS):
                 self._run_behaviour(name)
-            case Say(text=text, language=language) if not by_driver(skills.SPEECH):
+            case Say(text=text, language=language) if not by_driver(task_kinds.SPEECH):
                 self._say(text, language)
             case SetStiffness():
                 self._set_stiffness(skill)
@@ -116,7 +116,7 @@ class SkillRunner:
     def _start_line(self, utterance: Utterance) -> None:
         """Start to speak while the robot moves."""
         self._context.speech.start(utterance)
-        if self._context.performs(skills.SPEECH):
+        if self._context.performs(task_kinds.SPEECH):
             args = (utterance.text,)
             threading.Thread(target=self._speak_by_driver, args=args, name="speech", daemon=True).start()
 

@@ -2,12 +2,15 @@
 
 Messages that arrive together are stored as one row, distributed to the series, and then deleted. If the process is
 killed, a timer distributes the row; duplicate samples have no effect.
+
+Telemetry of joints carries no names. Samples that arrive before the description of their device wait in the queue,
+at most ``MAX_HELD`` rows of a device. The timer distributes them under the names of the description.
 """
 
 import asyncio
 import logging
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -34,6 +37,8 @@ BACKLOG_MS = 30_000
 """Rows older than this were left by a terminated process."""
 DROP_MS = 3_600_000
 """Rows that could not be distributed for this time are dropped."""
+MAX_HELD = 100
+"""Maximum number of queue rows per device that wait for its description."""
 MAX_ROW_BYTES = 200_000
 """Approximate maximum size of a queue row [bytes]."""
 _BYTES_PER_VALUE = 11
@@ -86,6 +91,7 @@ class TelemetryIngest:
         self._observers = tuple(observers)
         self._refuse = refuse
         self._agents: dict[str, _Agent] = {}
+        self._held: Counter[str] = Counter()
         self._turn = 0
 
     async def ingest(self, messages: Iterable[InboundMessage]) -> dict[int, str]:
@@ -99,7 +105,7 @@ class TelemetryIngest:
             StoreError: As above.
         """
         dropped: dict[int, str] = {}
-        parts: dict[tuple[str, str], list[tuple[int, Values]]] = defaultdict(list)
+        parts: dict[tuple[str, str, bool], list[tuple[int, Values]]] = defaultdict(list)
         devices: dict[str, Device] = {}
         for number, message in enumerate(messages):
             if number % _YIELD_EVERY == 0:
@@ -108,8 +114,11 @@ class TelemetryIngest:
             device = existing.devices.get(message.topic.device)
             if device is None or existing.space != message.topic.space:
                 continue
+            joints = existing.joints.get(message.topic.device)
+            if joints is not None:
+                self._held.pop(device.id, None)
             try:
-                sample = _sample(message, existing.joints.get(message.topic.device, ()))
+                sample = _sample(message, joints or ())
             except ProtocolError as error:
                 _log.warning("%s of %s dropped: %s", message.topic.name, device.id, error)
                 dropped[number] = str(error)
@@ -118,11 +127,28 @@ class TelemetryIngest:
                 dropped[number] = reason
                 continue
             devices[device.id] = device
-            parts[device.id, message.topic.name].append(sample)
-        gathered = [_Part(devices[id_], stream, series.from_rows(rows)) for (id_, stream), rows in parts.items()]
-        for batch in _batches(gathered):
+            parts[device.id, message.topic.name, joints is None and message.topic.name == topics.JOINTS].append(sample)
+        gathered = [
+            _Part(devices[id_], stream, series.from_rows(rows), unnamed)
+            for (id_, stream, unnamed), rows in parts.items()
+        ]
+        for batch in _batches([part for part in gathered if not part.unnamed]):
             await self._distribute(await self._queue(batch), batch)
+        for batch in _batches([part for part in gathered if part.unnamed]):
+            await self._hold(batch)
         return dropped
+
+    async def _hold(self, batch: Sequence["_Part"]) -> None:
+        """Queue samples until the description of their device is known. Those beyond ``MAX_HELD`` rows are dropped."""
+        if len(self._held) >= MAX_CACHED:
+            self._held.clear()
+        for part in batch:
+            self._held[part.device.id] += 1
+            if self._held[part.device.id] == MAX_HELD + 1:
+                _log.warning("%s sends telemetry of joints without a description; it is dropped", part.device.id)
+        within = [part for part in batch if self._held[part.device.id] <= MAX_HELD]
+        if within:
+            await self._queue(within)
 
     async def distribute_backlog(self) -> None:
         """Distribute a part of the rows that terminated processes left in the queue.
@@ -146,15 +172,21 @@ class TelemetryIngest:
         now_ms = self._clock.now_ms()
         data = {
             "parts": [
-                {"device": device.id, "pairing": device.pairing, "stream": stream, "samples": series.pack(samples)}
-                for device, stream, samples in batch
+                {
+                    "device": part.device.id,
+                    "pairing": part.device.pairing,
+                    "stream": part.stream,
+                    "samples": series.pack(part.samples),
+                    "unnamed": part.unnamed,
+                }
+                for part in batch
             ]
         }
         shard = str(now_ms // 1000 % SHARDS)
         return await self._tables.create(records.DATA, Row(shard, f"{now_ms:013d}:{new_id(8)}", data))
 
     async def _distribute(self, row: Row, batch: Sequence["_Part"]) -> None:
-        for device, stream, samples in batch:
+        for device, stream, samples, _ in batch:
             await asyncio.sleep(0)
             new = await self._writer.add(Place(device.id, device.pairing, stream), samples)
             if new:
@@ -162,14 +194,20 @@ class TelemetryIngest:
         await self._drop(row)
 
     async def _parts(self, row: Row) -> list["_Part"]:
-        """The samples in a queue row. Samples of unpaired devices are dropped."""
+        """The samples in a queue row. Samples of unpaired devices, and of devices without description, are dropped."""
         parts: list[_Part] = []
         for part in row.data["parts"]:
             agent, name = split_device(part["device"]) or ("", "")
             existing = await self._agent(agent)
             device = existing.devices.get(name)
-            if device is not None and device.pairing == part["pairing"]:
-                parts.append(_Part(device, part["stream"], series.unpack(part["samples"])))
+            if device is None or device.pairing != part["pairing"]:
+                continue
+            samples = series.unpack(part["samples"])
+            if part.get("unnamed"):
+                if name not in existing.joints:
+                    continue
+                samples = _named(samples, existing.joints[name])
+            parts.append(_Part(device, part["stream"], samples))
         return parts
 
     async def _notify_observers(self, device: Device, stream: str, new: Samples) -> None:
@@ -209,18 +247,19 @@ class TelemetryIngest:
 
 
 class _Part(NamedTuple):
-    """Samples of one stream of one device."""
+    """Samples of one stream of one device. ``unnamed``: the joints have indices instead of names."""
 
     device: Device
     stream: str
     samples: Samples
+    unnamed: bool = False
 
 
 def _batches(parts: Iterable[_Part]) -> Iterator[list[_Part]]:
     """Groups of parts that fit into one queue row."""
     batch: list[_Part] = []
     free = MAX_ROW_BYTES
-    for device, stream, samples in parts:
+    for device, stream, samples, unnamed in parts:
         fields = len(samples.columns)
         step = max(1, MAX_ROW_BYTES * 3 // 4 // (_BYTES_PER_VALUE * (fields + 2)))
         for begin in range(0, len(samples), step):
@@ -229,7 +268,7 @@ def _batches(parts: Iterable[_Part]) -> Iterator[list[_Part]]:
             if batch and size > free:
                 yield batch
                 batch, free = [], MAX_ROW_BYTES
-            batch.append(_Part(device, stream, piece))
+            batch.append(_Part(device, stream, piece, unnamed))
             free -= size
     if batch:
         yield batch
@@ -238,6 +277,20 @@ def _batches(parts: Iterable[_Part]) -> Iterator[list[_Part]]:
 def _joints(description: Description) -> Sequence[str]:
     """Field names of the joints; the index for names that are not valid field names."""
     return [joint.name if _JOINT.match(joint.name) else str(index) for index, joint in enumerate(description.joints)]
+
+
+def _named(samples: Samples, joints: Sequence[str]) -> Samples:
+    """Samples with the names of the joints in place of their indices."""
+    return Samples(samples.at_ms, {_renamed(field, joints): values for field, values in samples.columns.items()})
+
+
+def _renamed(field: str, joints: Sequence[str]) -> str:
+    quantity, _, index = field.partition(".")
+    return _field(quantity, int(index), joints) if index else field
+
+
+def _field(quantity: str, index: int, joints: Sequence[str]) -> str:
+    return f"{quantity}.{joints[index] if index < len(joints) else index}"
 
 
 def _sample(message: InboundMessage, joints: Sequence[str]) -> tuple[int, Values]:
@@ -269,7 +322,7 @@ def _joint_values(telemetry: JointTelemetry, joints: Sequence[str]) -> dict[str,
         ("effort_nm", telemetry.effort_nm),
     ):
         for index, value in enumerate(measured):
-            values[f"{quantity}.{joints[index] if index < len(joints) else index}"] = value
+            values[_field(quantity, index, joints)] = value
     if telemetry.mode is Mode.STREAMING:
         values["loop_age_ms"] = telemetry.loop_age_ms
     return values

@@ -35,7 +35,7 @@ class TestUse:
         problem(add(anna, "ur5"), 409, "robot-type-built-in")
         problem(anna.delete("/robot-types/ur5"), 409, "robot-type-built-in")
         ur5 = anna.get("/robot-types/ur5").json()
-        assert (ur5["actions"], ur5["mimic_joints"], ur5["postures"]) == (["move_joints"], [], [])
+        assert (ur5["actions"], ur5["mimic_joints"], ur5["postures"]) == (["move_joints", "move_pose"], [], [])
 
     def test_an_uploaded_type_is_listed_and_used_like_a_built_in_one(self, cloud: Cloud, anna: Person) -> None:
         added = add(anna)

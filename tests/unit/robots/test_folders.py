@@ -3,14 +3,20 @@
 import ast
 import runpy
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import mujoco
 import numpy as np
 import pytest
 
+from device_agent import geometry
+from device_agent.drivers.mujoco import _driver_class
 from device_agent.protocol import topics
 from device_agent.protocol.manifests import robot_type
+from device_agent.runtime.actions.device_context import DeviceContext
+from function_app.entrypoints.http.robot_types.serializers import robot_type_out
+from function_app.services.robot_types.catalogue import KnownType
 from tests.harness.paths import ROBOTS
 from tests.unit.robots.folders import FOLDERS, MOVEMENTS, SHIPPED, SteppedRobot, contacts
 
@@ -85,6 +91,23 @@ def test_a_shipped_type_has_movements_own_names_and_a_current_drawing(folder: Pa
     assert [name for name in names if name and not name.startswith(folder.name)] == [], "robots share worlds"
     draw = runpy.run_path(str(ROBOTS / "draw.py"))
     assert (folder / "drawing.json").read_bytes() == draw["drawing"](folder), "run python robots/draw.py"
+
+
+@pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
+def test_the_catalogue_lists_the_abilities_that_the_device_describes(folder: Path):
+    kind = robot_type.load(folder)
+    listed = robot_type_out(KnownType(kind, kind.version, {}, usable=True))
+    context: Any = DeviceContext(
+        robot_type=kind,
+        controller=None,  # type: ignore[arg-type]
+        observe=lambda: None,
+        geometry=geometry.load(kind, folder),
+        skills=_driver_class(kind),  # type: ignore[arg-type] # its class names the skills
+        readings=None,  # type: ignore[arg-type]
+        obstacle_map=lambda: None,
+    )
+    assert listed.actions == context.tasks()
+    assert listed.capabilities == kind.capabilities
 
 
 def test_movements_are_scripts_with_a_description():

@@ -4,7 +4,7 @@ from typing import Any
 
 import msgspec
 
-from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.protocol.manifests.task_kinds import kinds_of
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.robot_types.movements import Movement
 from function_app.domain.robot_types.robot_types import TypeVersion
@@ -26,26 +26,12 @@ def robot_type_out(robot_type: KnownType) -> schemas.RobotTypeOut:
         postures=tuple(manifest.postures),
         expressions=tuple(manifest.expressions),
         behaviours=tuple(manifest.behaviours),
-        actions=_actions(manifest),
+        actions=kinds_of(manifest),
         built_in=robot_type.built_in,
         state="ready" if robot_type.usable or upload is None else _upload_state(upload),
         files=robot_type.files,
         upload=None if upload is None else _upload(upload),
     )
-
-
-def _actions(manifest: RobotType) -> tuple[str, ...]:
-    """Action kinds that follow from the manifest. A driver or the floor map may add or exclude kinds."""
-    has = {
-        "move_joints": bool(manifest.joints),
-        "say": "speech" in manifest.capabilities,
-        "express": bool(manifest.expressions),
-        "take_posture": bool(manifest.postures),
-        "run_behaviour": bool(manifest.behaviours),
-        "drive": manifest.base is not None,
-        "go_to": manifest.base is not None,
-    }
-    return tuple(kind for kind, supported in has.items() if supported)
 
 
 def twin_out(model: Model) -> schemas.RobotTypeTwin:

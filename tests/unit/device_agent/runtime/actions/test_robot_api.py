@@ -232,6 +232,6 @@ def test_unknown_expressions_and_postures_are_rejected_with_the_known_ones(make_
     for task, expected in (
         (Express(name="sad"), "no expression 'sad'; there are glad, shy"),
         (TakePosture(name="Sit"), "no posture 'Sit'; there are Bow"),
-        (RunBehaviour(name="dance"), "this robot has no behaviour; it has move_joints, play, home, express, posture, "),
+        (RunBehaviour(name="dance"), "this robot has no behaviour; it has move_joints, express, posture, play, home, "),
     ):
         assert expected in harness.failed(task, epoch=1).message

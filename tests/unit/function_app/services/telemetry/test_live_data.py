@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from device_agent.protocol import JointTelemetry, Measurements, Mode, codec, topics
+from device_agent.protocol import Description, Joint, JointTelemetry, Measurements, Mode, codec, topics
 from function_app.services.storage import records
 from function_app.services.telemetry.series_writer import Place
 from tests.fakes.agent import Robot
@@ -29,6 +29,12 @@ def streams(anna: Person, robot: Robot) -> dict[str, Any]:
 
 
 def test_published_measurements_can_be_read(cloud: Cloud, anna: Person, robot: Robot) -> None:
+    limits: Any = dict.fromkeys(("upper_rad", "max_velocity_rad_s", "max_acceleration_rad_s2", "max_effort_nm"), 1.0)
+    arm = [Joint(name=name, label="", lower_rad=0.0, max_jerk_rad_s3=1.0, **limits) for name in ("a", "b")]
+    description = Description(device="arm", kind="arm", robot_type="ur5", label="Arm", joints=tuple(arm))
+    robot.publish(robot.topic(topics.DESC), description, retain=True)
+    described = (records.DESCRIPTIONS, robot.id, "arm")
+    wait_until(lambda: cloud.run(cloud.functions.tables.get(*described)), "the description to be stored")
     cloud.start_telemetry()
     begin_ms = cloud.clock.now_ms() - 60_000
     for number in range(100):
@@ -37,16 +43,16 @@ def test_published_measurements_can_be_read(cloud: Cloud, anna: Person, robot: R
     wait_until(lambda: {each["samples"] for each in streams(anna, robot).values()} == {100}, "all samples to be stored")
     found = streams(anna, robot)
     assert found["health"]["fields"] == ["temperature_c"]
-    assert found["joints"]["fields"] == ["position_rad.0", "position_rad.1"]
+    assert found["joints"]["fields"] == ["position_rad.a", "position_rad.b"]
 
     raw = anna.get(f"/devices/{robot.device}/data/health").json()
     assert (raw["resolution"], raw["span_ms"], raw["cursor"]) == ("raw", 0, None)
     assert raw["at_ms"] == [begin_ms + 200 * number for number in range(100)]
     assert raw["fields"]["temperature_c"]["mean"] == [40.0 + number for number in range(100)]
 
-    query = {"resolution": "1h", "fields": "position_rad.0", "from": begin_ms, "to": begin_ms + 20_000}
+    query = {"resolution": "1h", "fields": "position_rad.a", "from": begin_ms, "to": begin_ms + 20_000}
     hours = anna.get(f"/devices/{robot.device}/data/joints", params=query).json()
-    column = hours["fields"].pop("position_rad.0")
+    column = hours["fields"].pop("position_rad.a")
     assert hours["fields"] == {}
     assert sum(column["count"]) == 100
     assert (min(column["min"]), max(column["max"]), column["last"][-1]) == (0.0, 9.9, 9.9)

@@ -11,7 +11,15 @@ from function_app.domain.identity.accounts import Identity
 from function_app.domain.telemetry import series
 from function_app.domain.telemetry.series import Samples
 from function_app.services.storage import records
-from function_app.services.telemetry.ingest import BACKLOG_MS, DROP_MS, SHARDS, InboundMessage, TelemetryIngest, _Part
+from function_app.services.telemetry.ingest import (
+    BACKLOG_MS,
+    DROP_MS,
+    MAX_HELD,
+    SHARDS,
+    InboundMessage,
+    TelemetryIngest,
+    _Part,
+)
 from tests.harness.crash_injection import Killed
 from tests.unit.function_app.services.telemetry.telemetry_fixture import (
     AGENT,
@@ -40,25 +48,60 @@ async def test_measurements_of_claimed_devices_are_stored(setup: TelemetrySetup)
     assert means[-1][0] == NOW_MS
 
 
-async def test_joints_are_stored_under_their_names(setup: TelemetrySetup) -> None:
-    names = ("shoulder", "élbow", "wrist")
+async def describe(setup: TelemetrySetup, *names: str) -> None:
+    """Stores the description of the arm with joints of these names."""
     limits: dict[str, Any] = {"lower_rad": 0, "upper_rad": 1, "max_effort_nm": 1}
     limits |= {"max_velocity_rad_s": 1, "max_acceleration_rad_s2": 1, "max_jerk_rad_s3": 1}
     joints = tuple(Joint(name=name, label="", **limits) for name in names)
     description = Description(device="arm", kind="arm", robot_type="ur5", label="Arm", joints=joints)
     await records.upsert(setup.tables, records.DESCRIPTIONS, AGENT, "arm", lambda _: description, Description)
+
+
+def joints(at_ms: int = NOW_MS) -> InboundMessage:
     telemetry = JointTelemetry(
-        tick_ms=1, at_ms=NOW_MS, sequence=1, mode=Mode.STREAMING, position_rad=(0.1, 0.2, 0.3, 0.4),
+        tick_ms=1, at_ms=at_ms, sequence=1, mode=Mode.STREAMING, position_rad=(0.1, 0.2, 0.3, 0.4),
         velocity_rad_s=(1.0, 2.0, 3.0, 4.0), effort_nm=(5.0,), commanded_rad=(), loop_age_ms=12.0,
     )  # fmt: skip
-    await setup.ingest.ingest(
-        [InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "joints"), codec.encode(telemetry))]
-    )
+    return InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "joints"), codec.encode(telemetry))
+
+
+async def distribute_later(setup: TelemetrySetup) -> None:
+    """Runs the timer of another process after the samples have waited."""
+    setup.clock.at_ms += BACKLOG_MS + 1
+    _, ingest, _, _ = setup.instance()
+    for _ in range(SHARDS * 2):
+        await ingest.distribute_backlog()
+
+
+@pytest.mark.parametrize("described_first", [True, False])
+async def test_joints_are_stored_under_their_names(setup: TelemetrySetup, described_first: bool) -> None:
+    if described_first:
+        await describe(setup, "shoulder", "élbow", "wrist")
+    await setup.ingest.ingest([joints()])
+    if not described_first:
+        assert await setup.reader.streams(ANNA, DEVICE) == []
+        await describe(setup, "shoulder", "élbow", "wrist")
+        await distribute_later(setup)
     expected = {"loop_age_ms": 12.0, "effort_nm.shoulder": 5.0}
     for index, name in enumerate(("shoulder", "1", "wrist", "3")):
         expected[f"position_rad.{name}"] = (0.1, 0.2, 0.3, 0.4)[index]
         expected[f"velocity_rad_s.{name}"] = index + 1.0
     await assert_whole(setup, {NOW_MS: expected}, "joints")
+
+
+async def test_joints_of_a_device_that_never_sends_a_description_are_held_for_a_limited_time(
+    setup: TelemetrySetup,
+) -> None:
+    for number in range(MAX_HELD + 5):
+        await setup.ingest.ingest([joints(NOW_MS + number)])
+    assert await _queued(setup) == MAX_HELD
+    for _ in range(3):  # the timer processes a limited number of rows in a run
+        await distribute_later(setup)
+    assert await _queued(setup) == 0
+    assert await setup.reader.streams(ANNA, DEVICE) == []
+    await describe(setup, "shoulder")
+    await setup.ingest.ingest([joints()])
+    assert [each.name for each in await setup.reader.streams(ANNA, DEVICE)] == ["joints"]
 
 
 @pytest.mark.parametrize(
