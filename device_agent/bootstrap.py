@@ -289,6 +289,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
             faults=store.faults,
             uploads=uploads,
             load=load,
+            streaming=configuration.transport != "http",
         )
     agent = Agent(devices, transport, outbox=outbox, readings=readings, address=(pairing.space, pairing.agent))
     return RunningAgent(agent, journal, monitor, sandbox)
@@ -357,6 +358,7 @@ def _device(
     faults: Path,
     uploads: Uploads,
     load: LoadGovernor,
+    streaming: bool,
 ) -> Device:
     kind = type_of(entry)
     return Device(
@@ -380,6 +382,7 @@ def _device(
         speech=Espeak(),
         uploads=uploads,
         load=load,
+        streaming=streaming,
     )
 
 

@@ -19,7 +19,7 @@ _ROWS: Final = (
     ("late setpoints", "rejected if the loop age exceeds 200 ms", "–", "–", "–", "–"),
     ("limits", "position, velocity, acceleration, workspace, self-collision", "–", "–", "–", "–"),
     ("stop", "latches at the robot, needs a deliberate reset", "–", "–", "stops all components", "–"),
-    ("recording", "sessions, commands, hash-chained audit", "rosbag", "storages", "data capture", "MCAP"),
+    ("recording", "telemetry, commands, hash-chained audit", "rosbag", "storages", "data capture", "MCAP"),
 )
 _NOTE: Final = """Taken from the published documentation of the compared protocols, and of Viam, which uses gRPC; not
 measured here. – means that the application must provide it. Only the Telescope values above include these functions."""

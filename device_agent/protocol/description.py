@@ -149,6 +149,7 @@ class Description(Struct, frozen=True, kw_only=True):
         diagnostics: How the cloud evaluates the measurements of a room device; for robots, see the robot type.
         position_m: Position of a room device in the room; the stream ``positions`` of the room reports robots.
         base: Limits of a mobile base; ``None`` for a fixed robot.
+        streaming: Whether setpoints reach the device. ``False``: the agent polls over HTTP; use actions instead.
         scripts: ``sandboxed``: movement scripts run confined. ``unconfined``: they run with fewer layers, as the
             agent's owner allows. ``unavailable``: they are rejected.
         scripts_note: Why scripts are not sandboxed, and the remedy.
@@ -179,6 +180,7 @@ class Description(Struct, frozen=True, kw_only=True):
     diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=100)] = ()
     position_m: Vector3 | None = None
     base: BaseLimits | None = None
+    streaming: bool = True
     scripts: Literal["sandboxed", "unconfined", "unavailable"] = "unavailable"
     scripts_note: Text = ""
 

@@ -83,6 +83,7 @@ class Device:
         speech: Speech | None = None,
         uploads: Uploads | None = None,
         load: LoadGovernor | None = None,
+        streaming: bool = True,
     ) -> None:
         self.name = name
         self._load = load or LoadGovernor()
@@ -135,6 +136,7 @@ class Device:
             limits=self._controller.limits if robot_type.joints else (),
             actions=context.tasks() if room_device is None else room_device.actions,
             interlocks=[rule.description for rule in interlocks],
+            streaming=streaming,
             journal=journal,
             publish=publish,
             outbox=outbox,

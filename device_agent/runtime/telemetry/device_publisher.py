@@ -91,6 +91,7 @@ class DevicePublisher:
         limits: Sequence[str],
         actions: Sequence[str],
         interlocks: Sequence[InterlockDescription],
+        streaming: bool,
         journal: Journal,
         publish: Publish,
         outbox: Outbox,
@@ -104,6 +105,7 @@ class DevicePublisher:
         self._limits = tuple(limits)
         self._actions = tuple(actions)
         self._interlocks = tuple(interlocks)
+        self._streaming = streaming
         self._journal = journal
         self._publish = publish
         self._outbox = outbox
@@ -254,6 +256,7 @@ class DevicePublisher:
             # A manifest without a position leaves the origin.
             position_m=room.position_m if room is not None and any(room.position_m) else None,
             base=None if robot_type.base is None else BaseLimits(**limits_of(robot_type.base)._asdict()),
+            streaming=self._streaming,
             scripts=self.scripts.mode,
             scripts_note=self.scripts.reason[:2000],
         )

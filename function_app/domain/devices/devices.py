@@ -109,6 +109,11 @@ class Device:
     space_role: Role | None = None
     agent_key: str = ""
 
+    @property
+    def streaming(self) -> bool:
+        """Whether setpoints reach the device: a broker cannot deliver them to an agent that polls over HTTP."""
+        return self.transport != "http"
+
 
 def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) -> Agent:
     """The agent, claimed by ``account``. The claim code is consumed."""

@@ -29,8 +29,8 @@ CHECK_MS: Final = 15_000
 """Delay after which the timer checks a changed lease, in case the process was killed."""
 QUIET_MS: Final = 10_000
 """A process records the same rejection of the same person at most once in this time."""
-REFUSALS: Final = frozenset({"forbidden", "lease-held", "lease-lost", "lease-requested"})
-"""Recorded rejections: a missing role or lease."""
+REFUSALS: Final = frozenset({"forbidden", "lease-held", "lease-lost", "lease-requested", "streaming-unavailable"})
+"""Recorded rejections: a missing role or lease, or a device that accepts no setpoints."""
 REMINDER: Final = "lease"
 """Kind of the reminders to check a lease."""
 _EVENT: Final = "event:"

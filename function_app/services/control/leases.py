@@ -58,7 +58,7 @@ class Leases:
 
     async def acquire(
         self, caller: Identity, device_id: str, *, epoch: int | None, lease_ms: int, wait_ms: int, over: str = ""
-    ) -> tuple[Lease, bool, bytes]:
+    ) -> tuple[Lease, bool, bytes, bool]:
         """Acquire the lease, or renew ``epoch``.
 
         Also returns whether the device confirmed within ``wait_ms``, and the key that authenticates setpoints.
@@ -83,7 +83,7 @@ class Leases:
         confirmed = await self.grant(device, lease, by=caller.name, wait_ms=wait_ms)
         if before is not None and lease.reason and epoch is None:
             await self._revocation.cut(device, before.epoch)
-        return lease, confirmed, await self._setpoint_key(device, lease.epoch)
+        return lease, confirmed, await self._setpoint_key(device, lease.epoch), device.streaming
 
     async def _setpoint_key(self, device: Device, epoch: int) -> bytes:
         """The key of a lease. The device accepts it while it pins the signing key from which it is derived."""

@@ -103,12 +103,20 @@ class MqttCredentials:
     async def control(self, caller: Identity, device_id: str, epoch: int) -> IssuedCredentials:
         """Credentials to send setpoints in one epoch.
 
-        Raises ``device-unknown``, ``forbidden``, ``lease-lost`` or ``broker-unavailable``.
+        Raises ``device-unknown``, ``forbidden``, ``streaming-unavailable``, ``lease-lost`` or ``broker-unavailable``.
         """
         device = await self._devices.get(caller, device_id)
         now_ms = self._clock.now_ms()
         async with self._control_events.recording_rejections(device, caller, "steer"):
             require_operator(device)
+            if not device.streaming:
+                raise Problem(
+                    "streaming-unavailable",
+                    409,
+                    "The device accepts no setpoints",
+                    "The agent of this device polls over HTTP, so setpoints do not reach it. Use actions, or set the "
+                    "agent's transport to mqtt.",
+                )
             lease = rules.require_held(await read_lease(self._tables, device), caller, epoch=epoch, now_ms=now_ms)
         # Longer than the lease, which may be renewed, but not longer than the permission.
         lifetime_s = min(max(CONTROL_MIN_S, lease.lease_ms // 1000), max(1, (device.until_ms - now_ms) // 1000))

@@ -96,6 +96,7 @@ class PairedAgent:
         """Takes control and returns the epoch."""
         answer = self.processes.anna.take_lease(self.id, wait_ms=20_000, lease_ms=600_000)
         assert answer.json()["confirmed"], answer.text
+        assert answer.json()["streaming"] == self.device.publisher._description().streaming
         epoch: int = answer.json()["epoch"]
         return epoch
 

@@ -50,7 +50,7 @@ def _lease_routes(routes: Routes, functions: Functions, auth: RequestAuthenticat
         over = payload.reason.strip() if payload.take_over else ""
         if payload.take_over and (not over or payload.epoch is not None):
             raise invalid("take_over requires a reason, which is sent to the previous holder, and excludes epoch.")
-        lease, confirmed, setpoint_key = await functions.leases.acquire(
+        lease, confirmed, setpoint_key, streaming = await functions.leases.acquire(
             caller, device, epoch=payload.epoch, lease_ms=payload.lease_ms, wait_ms=payload.wait_ms, over=over
         )
         body = schemas.LeaseGranted(
@@ -60,6 +60,7 @@ def _lease_routes(routes: Routes, functions: Functions, auth: RequestAuthenticat
             lease_ms=lease.lease_ms,
             confirmed=confirmed,
             setpoint_key=setpoint_key.hex(),
+            streaming=streaming,
         )
         return json_response(body, headers={"Cache-Control": "no-store"})
 

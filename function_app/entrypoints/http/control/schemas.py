@@ -62,6 +62,7 @@ class LeaseGranted(Response, frozen=True, kw_only=True):
     """The caller's lease. ``confirmed``: the device has acknowledged it.
 
     ``setpoint_key``: secret key in hexadecimal that authenticates the setpoints of this lease.
+    ``streaming``: setpoints reach the device; otherwise only actions move it.
     """
 
     epoch: int
@@ -70,6 +71,7 @@ class LeaseGranted(Response, frozen=True, kw_only=True):
     lease_ms: int
     confirmed: bool
     setpoint_key: str
+    streaming: bool
 
 
 class LeaseStatus(Response, frozen=True, kw_only=True):

@@ -16,6 +16,7 @@ class DeviceOut(Response, frozen=True, kw_only=True):
     """A device. ``role``: the caller's role. ``state``: the newest ``state`` message of the device.
 
     ``incompatible``: why the agent and this server cannot work together, and which of them to update.
+    ``streaming``: setpoints reach the device; otherwise only actions move it.
     """
 
     id: str
@@ -28,6 +29,7 @@ class DeviceOut(Response, frozen=True, kw_only=True):
     role: Literal["owner", "operator", "viewer"]
     owner: AccountRef
     topic: str
+    streaming: bool
     online: bool
     incompatible: str | None
     last_seen_at: Moment | None

@@ -6,6 +6,7 @@ import { texts } from "./texts";
 
 /** Why the page cannot move the robot now; `null` if it can. */
 export function blockedReason(device: DeviceStore, control: Control): string | null {
+  if (device.description.value?.streaming === false) return texts.steer.noStreaming;
   if (control.streamer.value === null) return texts.joints.takeFirst;
   const mode = device.mode.value;
   if (device.stopped.value) return texts.joints.stopped;

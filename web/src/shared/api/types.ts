@@ -86,6 +86,8 @@ export interface GrantedLease {
   confirmed: boolean;
   /** Authenticates the setpoints of this lease; secret. */
   setpoint_key: string;
+  /** Whether setpoints reach the device; otherwise only actions move it. */
+  streaming: boolean;
 }
 
 export type ActionStatus = AckStatus | "queued" | "created" | "published";

@@ -96,6 +96,7 @@ const description = object<KnownDescription>({
   max_loop_age_ms: optional(count, 0),
   simulated: optional(flag, false),
   limits: optional(list(text, MAX_JOINTS), []),
+  streaming: optional(flag, true),
   scripts: optional(oneOf("sandboxed", "unavailable", "unconfined"), "unavailable"),
   scripts_note: optional(text, ""),
   interlocks: optional(

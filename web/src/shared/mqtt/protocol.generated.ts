@@ -43,6 +43,7 @@ export interface VersionRange {
  * diagnostics: How the cloud evaluates the measurements of a room device; for robots, see the robot type.
  * position_m: Position of a room device in the room; the stream `positions` of the room reports robots.
  * base: Limits of a mobile base; `None` for a fixed robot.
+ * streaming: Whether setpoints reach the device. `False`: the agent polls over HTTP; use actions instead.
  * scripts: `sandboxed`: movement scripts run confined. `unconfined`: they run with fewer layers, as the
  * agent's owner allows. `unavailable`: they are rejected.
  * scripts_note: Why scripts are not sandboxed, and the remedy.
@@ -77,6 +78,7 @@ export interface Description {
   diagnostics?: Diagnostic[];
   position_m?: [number, number, number] | null;
   base?: BaseLimits | null;
+  streaming?: boolean;
   scripts?: "sandboxed" | "unavailable" | "unconfined";
   scripts_note?: string;
 }

@@ -3,20 +3,22 @@ import type { ControlRequestInfo, GrantedLease, Watcher } from "../../../src/sha
 import { Control, LEASE_MS } from "../../../src/features/control/model/lease";
 import type { ControlRequestState } from "../../../src/features/control/model/control-request";
 import { Watchers } from "../../../src/features/control/model/watchers";
+import { blockedReason } from "../../../src/features/steering/blocked-notice";
+import { texts } from "../../../src/features/steering/texts";
 import { deliver, device, ends, pass, server } from "../../support/console";
 import { FakeLink } from "../../support/fake-link";
 import { sealed } from "../../../src/shared/mqtt/sealed-setpoint";
 import type { Tagged } from "../../../src/shared/mqtt/protocol.generated";
 import { list, none, ok, problem, unreachable, type Answer } from "../../support/fake-server";
-import { DEVICE, TOPIC, state, telemetry } from "../../support/messages";
+import { DEVICE, TOPIC, description, state, telemetry } from "../../support/messages";
 
 const LEASE = `/devices/${DEVICE}/lease`;
 const REQUEST = `${LEASE}/requests/r1`;
 const KEY = "00".repeat(32);
 const EXPIRES = "2030-01-01T00:00:00.000Z";
 
-function granted(epoch: number, confirmed = true): Answer {
-  return ok({ epoch, holder: "Ann", expires_at: EXPIRES, lease_ms: LEASE_MS, confirmed, setpoint_key: KEY } satisfies GrantedLease);
+function granted(epoch: number, confirmed = true, streaming = true): Answer {
+  return ok({ epoch, holder: "Ann", expires_at: EXPIRES, lease_ms: LEASE_MS, confirmed, setpoint_key: KEY, streaming } satisfies GrantedLease);
 }
 
 function request(outcome: ControlRequestInfo["outcome"] = "open"): ControlRequestInfo {
@@ -48,6 +50,22 @@ beforeEach(() => {
 const released = (): (string | null)[] => server.callsTo(`DELETE ${LEASE}`).map(({ query }) => query.get("epoch"));
 
 describe("control of a device", () => {
+  it("opens no setpoint connection to a device that setpoints do not reach, and keeps the lease", async () => {
+    server.on(`POST ${LEASE}`, granted(5, true, false));
+    let opened = 0;
+    const polled = new Control(server.api, device, () => {
+      opened += 1;
+      return setpoints;
+    });
+    ends.push(() => polled.dispose());
+    await polled.take();
+    expect(polled.state.value).toEqual({ kind: "held", epoch: 5, confirmed: true });
+    expect(blockedReason(device, polled)).toBe(texts.steer.noConnection);
+    deliver("desc", { ...description, streaming: false });
+    expect(blockedReason(device, polled)).toBe(texts.steer.noStreaming);
+    expect(opened).toBe(0);
+  });
+
   it("is renewed every third of the lease, until it is released with its epoch", async () => {
     await control.take();
     expect(control.state.value).toEqual({ kind: "held", epoch: 5, confirmed: true });

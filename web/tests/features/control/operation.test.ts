@@ -18,7 +18,7 @@ let setpoints: FakeLink;
 
 beforeEach(() => {
   setpoints = new FakeLink();
-  const lease = { epoch: 5, holder: "Demo", expires_at: "2030-01-01T00:00:00.000Z", lease_ms: LEASE_MS, confirmed: true, setpoint_key: "00".repeat(32) };
+  const lease = { epoch: 5, holder: "Demo", expires_at: "2030-01-01T00:00:00.000Z", lease_ms: LEASE_MS, confirmed: true, setpoint_key: "00".repeat(32), streaming: true };
   server.on(`POST ${LEASE}`, ok(lease));
   server.on(`GET ${LEASE}`, ok({ lease: null }));
   control = new Control(server.api, device, () => setpoints);

@@ -79,6 +79,19 @@ def test_control_requires_the_current_lease(cloud: Cloud, anna: Person, robot: R
     problem(anna.post("/mqtt/credentials", {**body, "epoch": epoch}), 409, "lease-lost")
 
 
+def test_a_device_of_a_polling_agent_gives_a_reason_for_rejected_setpoints(anna: Person, robot: Robot) -> None:
+    assert anna.take_lease(robot.device).json()["streaming"]
+    assert robot.enroll(transport="http").status_code == 200
+    lease = anna.post(f"/devices/{robot.device}/lease", {"take_over": True, "reason": "test", "wait_ms": 0}).json()
+    assert not lease["streaming"]
+    assert not anna.get(f"/devices/{robot.device}").json()["streaming"]
+    body = {"purpose": "control", "device": robot.device, "epoch": lease["epoch"]}
+    rejection = problem(anna.post("/mqtt/credentials", body), 409, "streaming-unavailable")
+    assert "polls over HTTP" in rejection["detail"]
+    (event, *_) = anna.get(f"/devices/{robot.device}/events").json()["items"]
+    assert event["data"]["code"] == "streaming-unavailable"
+
+
 def test_an_agent_gets_its_own_devices(robot: Robot) -> None:
     issued = robot.request("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
     own = f"ts/v1/{robot.space}/{robot.id}"

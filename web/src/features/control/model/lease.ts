@@ -168,12 +168,13 @@ export class Control {
     this.#response.value = { kind: "none" };
     this.#device.setLease({ holder: granted.holder, epoch, expires_at: granted.expires_at, mine: true });
     this.roundTrip.restart();
-    const link = this.#openLink(this.#device.id, epoch);
+    const link = granted.streaming ? this.#openLink(this.#device.id, epoch) : null;
     const topic = this.#device.topics.ctl(epoch);
     const streamer = new SetpointStreamer({
       epoch,
       joints: this.#device.description.value?.joints ?? [],
-      send: (setpoint) => link.publish(topic, sealed(setpoint, this.#setpointKey, topic), 0),
+      send: (setpoint) =>
+        link?.publish(topic, sealed(setpoint, this.#setpointKey, topic), 0) ?? Promise.reject(new Error("no setpoint connection")),
       telemetry: () => this.#device.telemetry.value,
     });
     this.#link = link;
@@ -184,6 +185,7 @@ export class Control {
     this.#renewed(granted, requestedAt);
     this.#cleanups = [
       effect(() => {
+        if (link === null) return;
         this.#linkStatus.value = link.status.value;
         if (link.status.value.state === "refused") this.#lose(link.status.value.reason);
       }),
