@@ -351,14 +351,18 @@ class Tracker:
 
 
 def _middle(cluster: Cluster, from_m: Floats, radius_m: float) -> Floats:
-    """Centre of an object whose near surface was seen, shape (2,) [m]."""
+    """Centre of an object whose near surface was seen, shape (2,) [m].
+
+    The mean of the near half of a circle is 2/π of its radius before the centre.
+    """
     points = cluster.points_m
     if points.shape[1] == 3 and cluster.height_m > TALL_M:  # noqa: PLR2004 - it has a height
         cluster = Cluster(points[points[:, 2] > cluster.height_m - HEAD_M])
     centre = cluster.middle_m
     direction = centre - from_m
     length = float(np.hypot(*direction))
-    if length < radius_m:
+    before_m = radius_m * 2 / math.pi
+    if length < before_m:
         return centre
-    result: Floats = centre + direction / length * radius_m
+    result: Floats = centre + direction / length * before_m
     return result

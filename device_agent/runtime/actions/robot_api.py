@@ -16,9 +16,9 @@ from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import gaze
 from device_agent.runtime.planning.keyframe_trajectory import MAX_SPEED, KeyframeTrajectory
-from device_agent.runtime.planning.localization import ODOMETRY, POSITIONS, PoseEstimator
+from device_agent.runtime.planning.localization import ODOMETRY, POSITIONS, Pose2D, PoseEstimator
 from device_agent.runtime.planning.motion_planner import MotionPlanner, quaternion_of
-from device_agent.runtime.planning.navigator import UPDATE_PERIOD_S, Navigator
+from device_agent.runtime.planning.navigator import MAX_APPROACHES, SETTLE_UPDATES, UPDATE_PERIOD_S, Navigator
 from device_agent.runtime.readings import Reading
 
 
@@ -156,18 +156,38 @@ class RobotApi:
         self.wait_for(self._context.controller.start_drive(self.reservation, twist, duration_s=call.duration_s))
 
     def _go_to(self, call: GoTo) -> None:
-        """Navigate by drives of limited duration: if this loop stops, the robot stops."""
-        context, controller = self._context, self._context.controller
+        """Approach the goal, and repeat it if the pose at rest shows that the robot is not there."""
+        context = self._context
         navigator = Navigator.for_robot(call.x_m, call.y_m, call.yaw_rad, context.robot_type)
         estimator = PoseEstimator(context.name)
+        for _ in range(MAX_APPROACHES):
+            self._approach(navigator, estimator)
+            pose = self._measure_at_rest(estimator)
+            if navigator.is_near(pose):
+                return
+        navigator.require_arrival(pose)
+
+    def _measure_at_rest(self, estimator: PoseEstimator) -> Pose2D:
+        """The pose after the robot has come to rest: positions from the room arrive late."""
+        for _ in range(SETTLE_UPDATES):
+            self.wait_for(self._context.controller.start_drive(self.reservation, REST, duration_s=UPDATE_PERIOD_S))
+            pose = self._pose(estimator)
+        return pose
+
+    def _pose(self, estimator: PoseEstimator) -> Pose2D:
+        context = self._context
+        room = context.readings.newest(POSITIONS, f"x_m.{context.name}")
+        return estimator.estimate(context.own_readings().get(ODOMETRY), room)
+
+    def _approach(self, navigator: Navigator, estimator: PoseEstimator) -> None:
+        """Drive by drives of limited duration: if this loop stops, the robot stops."""
+        context, controller = self._context, self._context.controller
         waited_s = 0.0
         while not self.ended.is_set():
             obstacle_map = None if context.obstacle_map is None else context.obstacle_map()
             if obstacle_map is None:
                 raise Refused("no_ground", "no sensor reports the obstacles in the room; drive manually")
-            pose = estimator.estimate(
-                context.own_readings().get(ODOMETRY), context.readings.newest(POSITIONS, f"x_m.{context.name}")
-            )
+            pose = self._pose(estimator)
             try:
                 twist, waited_s = navigator.compute_twist(pose, obstacle_map), 0.0
             except Refused as refused:
@@ -180,7 +200,6 @@ class RobotApi:
             drive = controller.start_drive(self.reservation, twist, duration_s=3 * UPDATE_PERIOD_S)
             if drive.finished.wait(UPDATE_PERIOD_S):
                 self.wait_for(drive)
-        self.wait_for(controller.start_drive(self.reservation, REST, duration_s=UPDATE_PERIOD_S))
 
     def wait_for(self, goal: MotionGoal) -> None:
         """Start the control period of a goal, and wait for the goal's end.

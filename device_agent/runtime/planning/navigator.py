@@ -20,7 +20,14 @@ _TRANSIENT = frozenset({"no_way", "taken"})
 _AHEAD_M = 0.2
 _REPLAN_UPDATES = 4
 """Updates between two path searches."""
-_NEAR_M, _NEAR_RAD = 0.04, 0.04
+MAX_APPROACHES = 3
+SETTLE_UPDATES = 10
+"""Updates at rest before the arrival is checked."""
+_NEAR_M, _NEAR_RAD = 0.03, 0.04
+_LEFT_M = 0.05
+"""A robot that drifts this far from the goal while it turns approaches again [m]."""
+_TOLERANCE_M, _TOLERANCE_RAD = 0.08, 0.1
+"""Largest error at rest; the position by the room's sensors has an error of about 2 cm [m], [rad]."""
 _SPEED_SHARE = 0.8
 _GAIN_1_S = 1.2
 """Proportional gain of distance and heading [1/s]."""
@@ -71,7 +78,7 @@ class Navigator:
         position = (pose.x_m, pose.y_m)
         distance_m = math.dist(self._goal, position)
         # A small overshoot does not restart the approach.
-        self._arrived = (self._arrived and distance_m < 3 * _NEAR_M) or distance_m <= _NEAR_M
+        self._arrived = (self._arrived and distance_m < _LEFT_M) or distance_m <= _NEAR_M
         if self._arrived:
             if self._yaw_rad is None:
                 return None
@@ -90,6 +97,31 @@ class Navigator:
         if abs(error) < _FACING_RAD:
             forward = min(_SPEED_SHARE * self._limits.forward_m_s, _GAIN_1_S * distance_m) * math.cos(error)
         return Twist(forward, 0.0, self._turn(error))
+
+    def is_near(self, pose: Pose2D) -> bool:
+        """Whether another approach would not bring the robot nearer to the goal."""
+        away_m, away_rad = self._errors(pose)
+        self._arrived = away_m <= _LEFT_M
+        return self._arrived and away_rad <= 2 * _NEAR_RAD
+
+    def require_arrival(self, pose: Pose2D) -> None:
+        """Check the pose at rest.
+
+        Raises:
+            Refused: ``not_arrived``: the robot is not at the goal.
+        """
+        away_m, away_rad = self._errors(pose)
+        if away_m > _TOLERANCE_M or away_rad > _TOLERANCE_RAD:
+            raise Refused(
+                "not_arrived",
+                f"did not arrive: the robot is {away_m:.2f} m and {away_rad:.2f} rad from the goal; "
+                "check for obstacles and slip",
+            )
+
+    def _errors(self, pose: Pose2D) -> tuple[float, float]:
+        """Distance from the goal [m] and from its heading [rad]."""
+        away_rad = 0.0 if self._yaw_rad is None else math.remainder(self._yaw_rad - pose.yaw_rad, 2 * math.pi)
+        return math.dist(self._goal, (pose.x_m, pose.y_m)), abs(away_rad)
 
     def _turn(self, error_rad: float) -> float:
         limit = _SPEED_SHARE * self._limits.turn_rad_s

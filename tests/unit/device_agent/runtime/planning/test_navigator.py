@@ -2,6 +2,7 @@
 
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import asdict, astuple, replace
 from typing import Self
 
@@ -167,14 +168,14 @@ def test_at_the_goal_the_robot_only_turns() -> None:
 class MobileRobot:
     """A base that follows the commands of a ``RobotApi`` in its own thread."""
 
-    def __init__(self, obstacle_map: OccupancyGrid | None) -> None:
+    def __init__(self, obstacle_map: OccupancyGrid | None, *, observed: Callable[[Pose2D], Pose2D] | None = None) -> None:
         self.fixture = ControllerFixture(base=BASE)
         self.pose = Pose2D(0.0, 0.0, 0.0)
         self.stopping = threading.Event()
         context = replace(
             device_context(robot_type(BASE)),
             controller=self.fixture.controller,
-            own_readings=lambda: {"odometry": Reading(asdict(self.pose), 0.0)},
+            own_readings=lambda: {"odometry": Reading(asdict(observed(self.pose) if observed else self.pose), 0.0)},
             obstacle_map=lambda: obstacle_map,
         )
         self.api = RobotApi(context)
@@ -202,6 +203,28 @@ def test_go_to_reaches_the_goal_and_rests() -> None:
         robot.api.execute(GoTo(x_m=0.3, y_m=0.0, yaw_rad=0.3))
         assert math.dist((robot.pose.x_m, robot.pose.y_m), (0.3, 0.0)) < 0.15
         assert not robot.fixture.controller.moving
+
+
+@pytest.mark.parametrize(("correct_after", "arrives"), [(1, True), (99, False)])
+def test_go_to_corrects_the_pose_at_rest_and_fails_if_the_robot_is_not_at_the_goal(
+    correct_after: int,
+    arrives: bool,  # noqa: FBT001
+) -> None:
+    rests = 0
+
+    def observed(pose: Pose2D) -> Pose2D:
+        """The position is late in motion: it is 0.2 m further back once the robot rests."""
+        nonlocal rests
+        late = not robot.fixture.controller.moving and pose.x_m > 0.1
+        rests += late
+        return replace(pose, x_m=pose.x_m - 0.2) if late and rests <= 12 * correct_after else pose
+
+    with MobileRobot(room(), observed=observed) as robot:
+        if arrives:
+            robot.api.execute(GoTo(x_m=0.3, y_m=0.0))
+        else:
+            with refuses("not_arrived"):
+                robot.api.execute(GoTo(x_m=0.3, y_m=0.0))
 
 
 @pytest.mark.parametrize(
