@@ -35,6 +35,19 @@ def show(claim: Claim, server: str, *, qr: bool, out: TextIO | None = None) -> N
     out.flush()
 
 
+def show_waiting(remaining_s: float, *, again: bool, out: TextIO | None = None) -> None:
+    """Print what the program waits for, and the remaining time of the claim code.
+
+    With ``again``, a terminal shows the new time in the same line; other outputs stay unchanged.
+    """
+    out = out or sys.stdout
+    if again and not out.isatty():
+        return
+    minutes, seconds = divmod(max(0, round(remaining_s)), 60)
+    text = f"waiting until an account redeems the claim code: {minutes}:{seconds:02d} minutes left"
+    print(f"\r{text}" if again else text, end="" if out.isatty() else "\n", file=out, flush=True)
+
+
 def qr_lines(text: str) -> list[str]:
     """A QR code as lines of equal length, with two rows of modules per line."""
     rows = [list(row) for row in segno.make(text, error="m", micro=False).matrix_iter(border=_QUIET_ZONE)]

@@ -1,6 +1,7 @@
 """``enroll``: register the agent with the server and wait until an account claims it."""
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
@@ -77,16 +78,22 @@ def announce(api: CloudClient, config: AgentConfig, *, qr: bool) -> Claim:
 def await_claim(store: IdentityStore, api: CloudClient, config: AgentConfig, claim: Claim, *, qr: bool) -> Pairing:
     """Wait until an account claims the agent, and save the pairing. Replaces expired claim codes."""
     expires_s = time.monotonic() + (claim.expires_in_s or 0)
+    again = False
     while True:
         systemd.notify_watchdog()
+        if claim.code is not None:
+            claim_prompt.show_waiting(expires_s - time.monotonic(), again=again)
+            again = True
         enrollment = api.enrollment(wait_s=_LONG_POLL_S if claim.code is not None else 0.0)
         if enrollment.get("state") == "claimed":
             pairing = pairing_of(responses.read(enrollment, responses.Claimed))
             store.save_pairing(pairing)
-            print(f"paired with {pairing.account}", flush=True)
+            print(f"{'\n' * (again and sys.stdout.isatty())}paired with {pairing.account}", flush=True)
             return pairing
         if time.monotonic() > expires_s:
+            print("the claim code has expired; here is a new one", flush=True)
             claim = announce(api, config, qr=qr)
+            again = False
             expires_s = time.monotonic() + (claim.expires_in_s or 0)
 
 

@@ -12,7 +12,6 @@ import pytest
 
 from device_agent.ports import script_calls
 from device_agent.protocol import GoTo, Measurements
-from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.authority.lease_gate import LeaseGate
@@ -26,9 +25,7 @@ from tests.unit.device_agent.perception.lab import PERIOD_S as SAMPLE_S
 from tests.unit.device_agent.perception.lab import LabFixture, manual_time
 from tests.unit.robots.simulated_robot import SimulatedRobot
 
-QBO = robot_type.load(ROBOTS / "qbo")
-PERIOD_S = QBO.period_ms / 1000
-NEAR_M, NEAR_RAD = 0.15, math.radians(10)
+NEAR_M, NEAR_RAD = 0.1, math.radians(10)
 
 
 pytestmark = pytest.mark.slow
@@ -49,7 +46,7 @@ class SteppingEvent(threading.Event):
 
     def wait(self, timeout: float | None = None) -> bool:
         until_s = self._lab.now_s + (60.0 if timeout is None else timeout)
-        while not self.is_set() and self._lab.now_s < until_s - PERIOD_S / 2:
+        while not self.is_set() and self._lab.now_s < until_s - self._lab.period_s / 2:
             self._lab.run_period()
         return self.is_set()
 
@@ -58,7 +55,7 @@ class SteppingController(Controller):
     """The agent's controller; waiting for its goals steps the laboratory."""
 
     def __init__(self, lab: "Laboratory") -> None:
-        super().__init__(QBO, LeaseGate())
+        super().__init__(lab.type, LeaseGate())
         self._lab = lab
 
     def start_drive(self, *args: Any, **kwargs: Any) -> Any:
@@ -73,11 +70,11 @@ class SteppingController(Controller):
 
 
 class Laboratory(SimulatedRobot):
-    """Qbo in its room, with driver, controller and obstacle map; the person walks, perception runs at 5 Hz."""
+    """A robot in its room, with driver, controller and obstacle map; the person walks, perception runs at 5 Hz."""
 
-    def __init__(self, *, settle_s: float = 3.0) -> None:
+    def __init__(self, *, settle_s: float = 3.0, robot: str = "qbo") -> None:
         self.room = LabFixture()
-        super().__init__(ROBOTS / "qbo", room=self.room.world.world)
+        super().__init__(ROBOTS / robot, room=self.room.world.world)
         self.controller = SteppingController(self)
         self.controller.start_at(self.driver.observe().position_rad)
         self.readings = ReadingCache(
@@ -90,16 +87,18 @@ class Laboratory(SimulatedRobot):
         self.sampled_s = -math.inf
         self.touched: set[str] = set()
         context = DeviceContext(
-            robot_type=QBO,
+            robot_type=self.type,
             controller=self.controller,
             observe=self.driver.observe,
             geometry=None,
             skills=None,
             readings=self.readings,
             own_readings=lambda: {
-                stream: Reading(self.driver.report(stream), 0.02) for stream in ("odometry", "sonar")
+                stream.name: Reading(self.driver.report(stream.name), 0.02)
+                for stream in self.type.streams
+                if stream.name in {"odometry", "sonar"}
             },
-            name="qbo",
+            name=robot,
             obstacle_map=lambda: self.room.fusion.grid,
         )
         self.robot = RobotApi(context)
@@ -108,7 +107,7 @@ class Laboratory(SimulatedRobot):
 
     def run_period(self) -> None:
         super().run_period()
-        if self.room.now_s - self.sampled_s >= SAMPLE_S - PERIOD_S / 2:
+        if self.room.now_s - self.sampled_s >= SAMPLE_S - self.period_s / 2:
             self.sample()
 
     def touching(self) -> set[str]:
@@ -124,7 +123,7 @@ class Laboratory(SimulatedRobot):
     def free(self, x_m: float, y_m: float) -> bool:
         """Whether the robot fits there with a margin of one cell for moving legs."""
         grid = self.room.fusion.grid
-        return not grid.blocked(QBO.base.radius_m + 0.15).at(x_m, y_m)  # type: ignore[union-attr]
+        return not grid.blocked(self.type.base.radius_m + 0.15).at(x_m, y_m)  # type: ignore[union-attr]
 
     def sample(self) -> None:
         now_s = self.sampled_s = self.room.now_s
@@ -204,7 +203,7 @@ def test_qbo_visits_several_places_while_a_person_walks(lab: Laboratory) -> None
             continue
         # The person stands at the goal and waits for the robot to leave.
         person_m = lab.room.world.place("person")[:2]
-        assert math.dist(person_m, (x_m, y_m)) < QBO.base.radius_m + 0.35  # type: ignore[union-attr]
+        assert math.dist(person_m, (x_m, y_m)) < lab.type.base.radius_m + 0.35  # type: ignore[union-attr]
 
 
 @pytest.mark.long

@@ -43,6 +43,20 @@ def test_the_qr_code_is_shown_if_requested_and_displayable(
     assert len(rows) == (len(claim_prompt.qr_lines(LINK)) if shown else 0)
 
 
+@pytest.mark.parametrize(
+    ("terminal", "expected"),
+    [
+        (Terminal, "{0} 4:59 minutes left\r{0} 0:07 minutes left"),
+        (io.StringIO, "{0} 4:59 minutes left\n"),
+    ],
+)
+def test_the_program_states_what_it_waits_for_and_how_long(terminal: type[io.StringIO], expected: str) -> None:
+    out = terminal()
+    claim_prompt.show_waiting(299.4, again=False, out=out)
+    claim_prompt.show_waiting(7.0, again=True, out=out)
+    assert out.getvalue() == expected.format("waiting until an account redeems the claim code:")
+
+
 def test_the_qr_code_is_complete() -> None:
     halves = {"█": (0, 0), "▀": (0, 1), "▄": (1, 0), " ": (1, 1)}
     modules = [[halves[mark][half] for mark in line] for line in claim_prompt.qr_lines(LINK) for half in (0, 1)]

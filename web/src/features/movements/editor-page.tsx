@@ -221,7 +221,7 @@ function Code({ api, fleet, script, sessions, checked, onChecked }: CodeProps) {
   return (
     <Card title={texts.editor.title} class="code-card" aside={<SaveState script={script} />}>
       <Restored script={script} />
-      <div class="code" data-testid="code" data-checked={String(checked?.of === script.text.value)} ref={host} />
+      <div class="code-editor" data-testid="code" data-checked={String(checked?.of === script.text.value)} ref={host} />
       <div class="row">
         <button
           type="button"

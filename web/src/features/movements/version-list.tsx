@@ -16,7 +16,7 @@ export function ScriptDiff({ before, after, label }: { before: string; after: st
     const comparison = new Comparison(host.current, before, after, label);
     return () => comparison.dispose();
   }, [before, after, label]);
-  return <div class="code difference" data-testid="difference" ref={host} />;
+  return <div class="code-editor difference" data-testid="difference" ref={host} />;
 }
 
 interface VersionsProps {
