@@ -88,7 +88,9 @@ def await_claim(store: IdentityStore, api: CloudClient, config: AgentConfig, cla
         if enrollment.get("state") == "claimed":
             pairing = pairing_of(responses.read(enrollment, responses.Claimed))
             store.save_pairing(pairing)
-            print(f"{'\n' * (again and sys.stdout.isatty())}paired with {pairing.account}", flush=True)
+            if again and sys.stdout.isatty():
+                print()  # ends the line of the waiting message
+            print(f"paired with {pairing.account}", flush=True)
             return pairing
         if time.monotonic() > expires_s:
             print("the claim code has expired; here is a new one", flush=True)
@@ -151,7 +153,16 @@ def _device(text: str) -> DeviceEntry:
     robot_type, _, driver = rest.partition(":")
     if not equals or not is_id(name):
         raise ConfigError(f"'{text}' is not NAME=TYPE; a name matches {ID_PATTERN}")
-    label = catalogue.TYPES.load(robot_type).label
+    known = catalogue.TYPES.folders()
+    label = catalogue.TYPES.load(robot_type).label if robot_type in known else ""
+    if not is_id(robot_type):
+        raise ConfigError(f"'{robot_type}' is not a robot type; known: {', '.join(known)}")
+    if robot_type not in known:
+        print(
+            f"robot type '{robot_type}' is not on this machine (known: {', '.join(known)}); `run` downloads it from the "
+            "account that redeems the claim code",
+            flush=True,
+        )
     if driver:
         drivers.load(driver)
     return DeviceEntry(name=name, type=robot_type, driver=driver, label=label)

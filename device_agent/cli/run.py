@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from device_agent import bootstrap
-from device_agent.cli import systemd
+from device_agent.cli import robot_types, systemd
 from device_agent.cli.arguments import Commands, add_home, add_no_qr
 from device_agent.cli.enroll import announce, await_claim
 from device_agent.config.agent_config import AgentConfig
@@ -39,8 +39,10 @@ def _run(options: argparse.Namespace) -> int:
             _pair(store, qr=not options.no_qr)
         if options.trace is not None:
             options.trace.mkdir(parents=True, exist_ok=True)
+        robot_types.update(store)
         while _run_until_unpaired(store, options.trace):
             _pair(store, qr=not options.no_qr)
+            robot_types.update(store)
     return 0
 
 

@@ -84,6 +84,13 @@ def search_paths() -> tuple[Path, ...]:
     return (ROBOTS, *(Path(path).expanduser().resolve() for path in extra if path))
 
 
+def add_search_path(folder: Path) -> None:
+    """Add a search path after the others, for this process and its child processes."""
+    paths = [path for path in os.environ.get(ROBOTS_PATH, "").split(os.pathsep) if path]
+    if str(folder) not in paths:
+        os.environ[ROBOTS_PATH] = os.pathsep.join([*paths, str(folder)])
+
+
 def type_of(entry: DeviceEntry) -> robot_type.RobotType:
     """The robot type of a device entry; for a room device, derived from the room's manifest.
 
@@ -129,11 +136,18 @@ def entries_of(name: str) -> list[DeviceEntry]:
 def enrolled_devices(configuration: AgentConfig) -> list[dict[str, str]]:
     """The devices as the cloud receives them at enrollment.
 
+    The kind of a robot type that is not downloaded yet is ``robot``; it is corrected at the next connection.
+
     Raises:
-        ConfigError: A type or room is unknown.
+        ConfigError: A room is unknown, or a manifest is wrong.
     """
     entries = []
+    known = TYPES.folders()
     for device in configuration.devices:
+        if not device.room and device.type not in known:
+            label = device.label or device.name
+            entries.append({"name": device.name, "kind": "robot", "robot_type": device.type, "label": label})
+            continue
         kind = type_of(device)
         entries.append(
             {"name": device.name, "kind": kind.kind, "robot_type": kind.type, "label": device.label or kind.label}

@@ -72,6 +72,7 @@ class IdentityStore:
         self.journal = folder / "journal.db"
         self.outbox = folder / "outbox.db"
         self.faults = folder / "faults"
+        self.robot_types = folder / "robot_types"
         self._pairing = folder / "pairing.json"
 
     def private_key(self, *, create: bool = False) -> Ed25519PrivateKey:

@@ -1,5 +1,6 @@
 """Client of the HTTP API for agents: enrollment, credentials, and messages for agents without a broker."""
 
+import base64
 import time
 import uuid
 from collections.abc import Collection, Iterable
@@ -164,6 +165,15 @@ class CloudClient:
     def certificate(self, request: str) -> dict[str, Any]:
         """A client certificate for a request (PKCS 10, PEM)."""
         return self._call("POST", "/agents/certificate", json={"request": request})
+
+    def robot_type(self, agent: str, name: str) -> tuple[bytes, dict[str, bytes]]:
+        """The signed statement about a robot type of the agent's owner, and its files. Not verified."""
+        response = self._call("GET", f"/agents/{agent}/robot-types/{name}")
+        try:
+            files = {file: base64.b64decode(text, validate=True) for file, text in response["files"].items()}
+            return response["statement"].encode(), files
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise CloudError(f"the cloud's response is not a robot type: {error}") from error
 
     def post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
         """POST to a path below ``/api/v1``."""

@@ -38,7 +38,14 @@ from function_app.entrypoints.http.framework.routing import (
 from function_app.entrypoints.http.health import diagnostics, faults, health_check
 from function_app.entrypoints.http.messaging import polling, xmpp
 from function_app.entrypoints.http.pairing import agents
-from function_app.entrypoints.http.robot_types import device_library, movements, previews, robot_types, script_editor
+from function_app.entrypoints.http.robot_types import (
+    agent_packages,
+    device_library,
+    movements,
+    previews,
+    robot_types,
+    script_editor,
+)
 from function_app.entrypoints.http.sharing import routes as sharing
 from function_app.entrypoints.http.telemetry import blob_transfers, events, latency, series, uploads
 from function_app.ports.clock import Clock
@@ -49,8 +56,8 @@ _SECURE_FOR = b"max-age=31536000"
 """One year [s]: browsers that used TLS once use only TLS."""
 _MODULES = (
     auth, me, oidc, api_keys, agents, polling, audit, devices, device_library, sharing, lease, stop, actions, many,
-    robot_types, previews, movements, script_editor, mqtt_credentials, xmpp, latency, faults, events, diagnostics,
-    series, uploads, health_check,
+    robot_types, agent_packages, previews, movements, script_editor, mqtt_credentials, xmpp, latency, faults, events,
+    diagnostics, series, uploads, health_check,
 )  # fmt: skip
 """In the order of the OpenAPI document."""
 _log = logging.getLogger(__name__)

@@ -173,10 +173,23 @@ class RobotTypes:
         Raises:
             Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``file-unknown``.
         """
+        _, files = await self._active(caller, robot_type)
+        return await asyncio.to_thread(_zip, {f"{robot_type}/{name}": content for name, content in files.items()})
+
+    async def package(self, caller: Identity, robot_type: str, *, agent: str) -> tuple[bytes, dict[str, bytes]]:
+        """A signed statement about the active version for one agent, and its files.
+
+        Raises:
+            Problem: As ``archive``.
+        """
+        version, files = await self._active(caller, robot_type)
+        return await self._integrity.package(agent, robot_type, version, files), files
+
+    async def _active(self, caller: Identity, robot_type: str) -> tuple[int, dict[str, bytes]]:
         await self.get(caller, robot_type)
         existing = await self.view(caller, robot_type)
-        files = {f"{robot_type}/{name}": await self.file(caller, robot_type, name) for name in sorted(existing.files)}
-        return await asyncio.to_thread(_zip, files)
+        files = {name: await self.file(caller, robot_type, name) for name in sorted(existing.files)}
+        return existing.version, files
 
     async def _find(self, caller: Identity, robot_type: str) -> KnownType | None:
         built_in = (await self._catalogue.types()).get(robot_type)

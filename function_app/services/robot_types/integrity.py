@@ -6,7 +6,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from device_agent.protocol import codec
 from device_agent.protocol.errors import SignatureError
+from device_agent.protocol.manifests import package
+from device_agent.protocol.manifests.package import RobotTypePackage
 from device_agent.protocol.security import signing
 from function_app.domain.common.problems import Problem
 from function_app.domain.robot_types.robot_types import Seal, TypeHead, TypeVersion
@@ -30,6 +33,12 @@ class IntegritySeals:
         text = _text(account, robot_type, upload.version, upload.manifest, hashes)
         signature = signing.sign_text(text, key, context=_CONTEXT)
         return replace(upload, seal=Seal(signing.key_id(key.public_key()), signature, hashes))
+
+    async def package(self, agent: str, robot_type: str, version: int, files: Mapping[str, bytes]) -> bytes:
+        """The signed statement about these files for one agent."""
+        hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+        stated = RobotTypePackage(agent=agent, type=robot_type, version=version, files=hashes)
+        return signing.sign(codec.encode(stated), await self._keys.current(), context=package.CONTEXT)
 
     async def check(self, account: str, robot_type: str, stored: TypeHead | TypeVersion) -> Seal:
         """The seal, if it is valid for this manifest.

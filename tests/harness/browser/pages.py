@@ -17,6 +17,15 @@ _GRAVE: Final = """async (part) => {
         .filter((each) => ["serious", "critical"].includes(each.impact))
         .flatMap((each) => each.nodes.map((node) => `${each.id}: ${node.target.join(" ")}: ${node.failureSummary}`));
 }"""
+_CLIPPED: Final = """() => {
+    const name = (each) => `${each.tagName.toLowerCase()}#${each.id}.${each.className}`;
+    const shown = [...document.body.querySelectorAll("*")].filter((each) => each.checkVisibility());
+    const tall = shown.filter((each) => each.matches("input, select, button") && each.offsetHeight > 200);
+    const tables = shown.filter((each) => each.matches("table")).map((each) => each.parentElement);
+    const cut = tables.filter((each) => each.scrollWidth > each.clientWidth + 1);
+    return [...tall.map((each) => `${name(each)} is ${each.offsetHeight} px tall`),
+            ...cut.map((each) => `table in ${name(each)}: ${each.scrollWidth} px in ${each.clientWidth} px`)];
+}"""
 _DRAWN_WITHIN_MS: Final = 1_000
 _LOOKS: Final = 20
 _BETWEEN_LOOKS_MS: Final = 100
@@ -55,6 +64,8 @@ def assert_good_page(page: Page, name: str, *, part: str | None = None) -> None:
                 break
             page.wait_for_timeout(_BETWEEN_LOOKS_MS)  # canvases are redrawn shortly after a resize
         assert outside == [], f"{name} is wider than {size['width']} pixels: " + "; ".join(outside)
+        clipped = page.evaluate(_CLIPPED)
+        assert clipped == [], f"{name} at {size['width']} pixels: " + "; ".join(clipped)
         if os.environ.get("TELESCOPE_PICTURES"):
             _picture(page, _PICTURES / f"console-{name}-{size['width']}.png", chosen)
 

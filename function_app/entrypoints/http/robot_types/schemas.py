@@ -75,6 +75,16 @@ class RobotTypeRequest(Request, frozen=True, kw_only=True):
     wait_ms: WaitMs = 10_000
 
 
+class RobotTypePackageOut(Response, frozen=True, kw_only=True):
+    """A robot type for an agent. ``files``: name → base64, with ``robot.toml``.
+
+    ``statement``: signed envelope with agent, type, version and the SHA-256 of each file.
+    """
+
+    statement: str
+    files: dict[str, str]
+
+
 class RobotTypeTwin(Response, frozen=True, kw_only=True):
     """The geometry of a robot type. ``device`` and ``bodies`` have the same form as in the message ``desc/twin``.
 
