@@ -190,8 +190,9 @@ def test_qbo_drives_around_another_robot(lab: Laboratory) -> None:
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
-def test_qbo_visits_several_places_while_a_person_walks(lab: Laboratory) -> None:
-    rng = random.Random(5)  # noqa: S311
+@pytest.mark.parametrize("seed", range(5))
+def test_qbo_visits_several_places_while_a_person_walks(lab: Laboratory, seed: int) -> None:
+    rng = random.Random(seed)  # noqa: S311
     visited = 0
     while visited < 12:
         x_m, y_m, yaw_rad = rng.uniform(-2.2, 2.2), rng.uniform(-1.8, 1.8), rng.uniform(-math.pi, math.pi)
