@@ -1,6 +1,7 @@
 """Acquires, renews and releases leases."""
 
 import logging
+from typing import NamedTuple
 
 from device_agent.protocol import GrantLease, ReleaseLease, topics
 from device_agent.protocol.fields import printable
@@ -22,6 +23,22 @@ from function_app.services.devices.device_access import DeviceAccess, require_op
 from function_app.services.messaging.command_sender import CommandSender
 
 _log = logging.getLogger(__name__)
+
+
+class AcquiredLease(NamedTuple):
+    """A lease for its holder.
+
+    Attributes:
+        lease: The lease.
+        confirmed: Whether the device confirmed it in time.
+        setpoint_key: Authenticates the setpoints of the lease.
+        streaming: Whether setpoints reach the device.
+    """
+
+    lease: Lease
+    confirmed: bool
+    setpoint_key: bytes
+    streaming: bool
 
 
 class Leases:
@@ -58,10 +75,9 @@ class Leases:
 
     async def acquire(
         self, caller: Identity, device_id: str, *, epoch: int | None, lease_ms: int, wait_ms: int, over: str = ""
-    ) -> tuple[Lease, bool, bytes, bool]:
+    ) -> AcquiredLease:
         """Acquire the lease, or renew ``epoch``.
 
-        Also returns whether the device confirmed within ``wait_ms``, and the key that authenticates setpoints.
         ``over`` is the reason for a takeover, which requires the role owner. The caller's permission on the device
         limits ``lease_ms``. Raises ``device-unknown``, ``forbidden``, ``lease-held``, ``lease-lost`` or ``busy``.
         """
@@ -83,7 +99,7 @@ class Leases:
         confirmed = await self.grant(device, lease, by=caller.name, wait_ms=wait_ms)
         if before is not None and lease.reason and epoch is None:
             await self._revocation.cut(device, before.epoch)
-        return lease, confirmed, await self._setpoint_key(device, lease.epoch), device.streaming
+        return AcquiredLease(lease, confirmed, await self._setpoint_key(device, lease.epoch), device.streaming)
 
     async def _setpoint_key(self, device: Device, epoch: int) -> bytes:
         """The key of a lease. The device accepts it while it pins the signing key from which it is derived."""
