@@ -45,10 +45,7 @@ def test_the_qr_code_is_shown_if_requested_and_displayable(
 
 @pytest.mark.parametrize(
     ("terminal", "expected"),
-    [
-        (Terminal, "{0} 4:59 minutes left\r{0} 0:07 minutes left"),
-        (io.StringIO, "{0} 4:59 minutes left\n"),
-    ],
+    [(Terminal, "{0} 4:59 minutes left\r{0} 0:07 minutes left"), (io.StringIO, "{0} 4:59 minutes left\n")],
 )
 def test_the_program_states_what_it_waits_for_and_how_long(terminal: type[io.StringIO], expected: str) -> None:
     out = terminal()

@@ -168,7 +168,9 @@ def test_at_the_goal_the_robot_only_turns() -> None:
 class MobileRobot:
     """A base that follows the commands of a ``RobotApi`` in its own thread."""
 
-    def __init__(self, obstacle_map: OccupancyGrid | None, *, observed: Callable[[Pose2D], Pose2D] | None = None) -> None:
+    def __init__(
+        self, obstacle_map: OccupancyGrid | None, *, observed: Callable[[Pose2D], Pose2D] | None = None
+    ) -> None:
         self.fixture = ControllerFixture(base=BASE)
         self.pose = Pose2D(0.0, 0.0, 0.0)
         self.stopping = threading.Event()
@@ -207,8 +209,7 @@ def test_go_to_reaches_the_goal_and_rests() -> None:
 
 @pytest.mark.parametrize(("correct_after", "arrives"), [(1, True), (99, False)])
 def test_go_to_corrects_the_pose_at_rest_and_fails_if_the_robot_is_not_at_the_goal(
-    correct_after: int,
-    arrives: bool,  # noqa: FBT001
+    correct_after: int, arrives: bool
 ) -> None:
     rests = 0
 

@@ -61,7 +61,7 @@ def test_a_lease_is_unconfirmed_without_an_ack_of_the_robot(anna: Person, robot:
     answer = call().json()
     assert answer.pop("expires_at")
     assert answer.pop("setpoint_key")
-    assert answer == {"epoch": 3, "holder": "anna", "lease_ms": 30_000, "confirmed": False}
+    assert answer == {"epoch": 3, "holder": "anna", "lease_ms": 30_000, "confirmed": False, "streaming": True}
 
 
 def test_the_holder_gets_the_key_that_the_agent_derives_from_the_grant(anna: Person, robot: Robot) -> None:
