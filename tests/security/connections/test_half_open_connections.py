@@ -128,9 +128,11 @@ def test_half_open_connections_do_not_delay_stop_and_leave_no_socket(
                 taken_s["MQTT"].append(operator.stop_over_mqtt())
                 time.sleep(size.every_s)
             link.transport._connection._client.socket().shutdown(socket.SHUT_RDWR)  # type: ignore[attr-defined]
-            link.up(times=2)
+            if kind == "amqtt":  # mosquitto does not limit connections without a CONNECT
+                link.up(times=2)
             assert set(operator.read_responses()) == {200}
             attackers.close()
+        link.up(times=2)
         wait_until(lambda: server_sockets(*ports) <= before, "the sockets of the other connections to close")
     figures = {name: f"p50 {_share(each, 0.5):.3f} s, p99 {_share(each, 0.99):.3f} s" for name, each in taken_s.items()}
     logging.getLogger(__name__).info("Stop during the attack, %s: %s", kind, figures)
