@@ -1,5 +1,7 @@
 """Passwords of local accounts: sign-in, change, and registration."""
 
+import asyncio
+import hashlib
 from dataclasses import dataclass
 from typing import Final
 
@@ -20,10 +22,17 @@ from function_app.services.storage import records
 
 GUESS: Final = Guess("password", 300_000, "Too many wrong passwords.")
 WRONG_TRIES: Final = 10
-"""Per account in five minutes: a million per year, of more than 10²⁰ possible passwords of twelve characters. NIST
-SP 800-63B allows 100 consecutive attempts."""
+"""Per account and address, and per known browser of an account, in five minutes."""
 WRONG_TRIES_FROM: Final = 30
 """Per address; an address may serve many people."""
+SLOW_AFTER: Final = 100
+"""Attempts per account in five minutes from all addresses; further ones are delayed. They are never rejected, because
+an attacker with many addresses must not lock the owner out."""
+SLOWEST_S: Final = 4.0
+"""Longest delay of an attempt [s]."""
+SLOWER_S: Final = 0.05
+"""Additional delay per attempt beyond ``SLOW_AFTER`` [s]."""
+_NO_LIMIT: Final = 2**53
 WRONG: Final = "wrong-password"
 _PASSWORD: Final = "password"  # noqa: S105 (the key of a row)
 _NO_ACCOUNT: Final = "name:"
@@ -62,15 +71,15 @@ class Passwords:
 
     async def sign_in(self, name: str, password: str, origin: SignInOrigin) -> SignedIn:
         """Sign in. For unknown names, time and response are the same. Raises ``unauthorized`` or ``too-many-tries``."""
-        # Count by address first: beyond its limit, invented names create no rows.
-        counters = {**by_address(origin.address, WRONG_TRIES_FROM), named_partition(name): WRONG_TRIES}
+        account_of_name = await self._sign_in.known(name)
+        account = account_of_name.id if account_of_name else ""
+        counters = _counters(name, origin.address, await self._sessions.known_device(account, origin))
         try:
-            await self._guess_limiter.add_failure(GUESS, counters)
+            tries = await self._guess_limiter.add_failure(GUESS, counters)
         except Problem as problem:
             await self._refused("", origin, problem.code)
             raise
-        account_of_name = await self._sign_in.known(name)
-        account = account_of_name.id if account_of_name else ""
+        await asyncio.sleep(min(SLOWEST_S, SLOWER_S * max(0, tries - SLOW_AFTER)))
         row, stored = await records.find(self._tables, records.ACCOUNTS, account or _NO_ACCOUNT, _PASSWORD, _Stored)
         valid = await self._hasher.check(stored.hash if stored else None, normalize(password))
         if account_of_name is None or row is None or stored is None or not valid:
@@ -155,7 +164,7 @@ class Passwords:
                     "Enter the old password, or use a new one-time link and set the password within 10 minutes."
                 )
             return
-        counters = {**by_address(origin.address, WRONG_TRIES_FROM), named_partition(caller.name): WRONG_TRIES}
+        counters = {f"session:{caller.session}": WRONG_TRIES}
         await self._guess_limiter.add_failure(GUESS, counters)
         if not await self._hasher.check(records.read(row, _Stored).hash if row else None, normalize(old)):
             await self._refused(caller.account, origin, WRONG)
@@ -176,3 +185,15 @@ class Passwords:
             await self._tables.replace(records.ACCOUNTS, row.changed(records.to_data(created)))
         except Conflict:
             return  # changed concurrently
+
+
+def _counters(name: str, address: str, device: str) -> dict[str, int]:
+    """The counters of an attempt. The last one counts all attempts for the account and has no limit.
+
+    Count by address first: beyond its limit, invented names create no rows. A known ``device`` has its own counter, so
+    attempts of others do not affect it.
+    """
+    if device:
+        return {f"device:{device}": WRONG_TRIES}
+    partition = f"name:{hashlib.sha256(named_partition(name).encode()).hexdigest()}"
+    return {**by_address(address, WRONG_TRIES_FROM), f"{partition}@{address}": WRONG_TRIES, partition: _NO_LIMIT}

@@ -27,9 +27,13 @@ ALGORITHM = "EdDSA"
 API: Final = "telescope/api"
 SESSION: Final = "telescope/session"
 XMPP: Final = "telescope/xmpp"
+DEVICE: Final = "telescope/device"
+"""A browser or program that has signed in before. Its token grants nothing but its own limit of wrong passwords."""
 ACCESS_S = 15 * 60
 """Lifetime of an access token [s]. The session cookie gets the next one."""
 SESSION_S = 12 * 3600
+DEVICE_S: Final = 180 * 86_400
+"""Validity of the token of a known browser after its last sign-in [s]."""
 AGENT_TOKEN_S = 60
 CLOCK_SKEW_S = 30
 """Tolerated clock difference of an agent [s]."""
@@ -37,7 +41,7 @@ MAX_CACHED_TOKENS = 4096
 RECHECK_MS = 5_000
 """Interval at which a cached token is checked for sign-out again [ms]."""
 
-Audience = Literal["telescope/api", "telescope/session", "telescope/xmpp"]
+Audience = Literal["telescope/api", "telescope/session", "telescope/xmpp", "telescope/device"]
 
 
 @dataclass(slots=True)

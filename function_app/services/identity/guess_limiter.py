@@ -34,27 +34,29 @@ class GuessLimiter:
         self._retention = retention
         self._clock = clock
 
-    async def add_failure(self, guess: Guess, counters: Mapping[str, int]) -> None:
+    async def add_failure(self, guess: Guess, counters: Mapping[str, int]) -> int:
         """Count an attempt before it is checked, so that parallel attempts cannot bypass the limit.
 
-        ``counters`` maps each counter to the failures that it allows per window. Raises ``too-many-tries``; such an
-        attempt is not counted.
+        ``counters`` maps each counter to the failures that it allows per window. Returns the count of the last one.
+        Raises ``too-many-tries``; such an attempt is not counted.
         """
+        count = 0
         done: dict[str, int] = {}
         for counter, most in counters.items():
             try:
-                await self._change(guess, counter, 1, most)
+                count = await self._change(guess, counter, 1, most)
             except Problem:
                 await self.remove_failure(guess, done)
                 raise
             done[counter] = most
+        return count
 
     async def remove_failure(self, guess: Guess, counters: Mapping[str, int]) -> None:
         """Remove a successful attempt from the count."""
         for counter, most in counters.items():
             await self._change(guess, counter, -1, most)
 
-    async def _change(self, guess: Guess, counter: str, change: int, most: int) -> None:
+    async def _change(self, guess: Guess, counter: str, change: int, most: int) -> int:
         now_ms = self._clock.now_ms()
 
         def counted(tries: _Tries | None) -> _Tries:
@@ -69,7 +71,8 @@ class GuessLimiter:
         # One deletion per window, scheduled before the row is written.
         due_ms = (now_ms // guess.window_ms + 2) * guess.window_ms
         await self._retention.delete_row_at(records.ATTEMPTS, counter, guess.what, due_ms=due_ms)
-        await records.upsert(self._tables, records.ATTEMPTS, counter, guess.what, counted, _Tries)
+        tries = await records.upsert(self._tables, records.ATTEMPTS, counter, guess.what, counted, _Tries)
+        return tries.count if tries else 0
 
 
 def by_address(address: str, most: int) -> dict[str, int]:

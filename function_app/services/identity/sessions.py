@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from function_app.domain.audit.hash_chain import AccountEvent
+from function_app.domain.common.ids import new_id
+from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Account, Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
@@ -11,6 +13,8 @@ from function_app.services.audit.audit_log import AuditLog
 from function_app.services.identity.authenticator import (
     ACCESS_S,
     API,
+    DEVICE,
+    DEVICE_S,
     SESSION,
     SESSION_S,
     Authenticator,
@@ -29,10 +33,16 @@ _ROW: Final = "session:"
 
 @dataclass(frozen=True, slots=True)
 class SignInOrigin:
-    """Origin of a sign-in as known from the request; visible to the account only."""
+    """Origin of a sign-in as known from the request; visible to the account only.
+
+    Attributes:
+        program: User agent.
+        device_token: Received at an earlier sign-in; not verified.
+    """
 
     address: str = ""
     program: str = ""
+    device_token: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +63,17 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class SignedIn:
-    """A new sign-in session. A page sends the ``csrf`` token with its HTTP-only ``cookie``."""
+    """A new sign-in session. A page sends the ``csrf`` token with its HTTP-only ``cookie``.
+
+    ``device_token`` identifies the browser at its next sign-in.
+    """
 
     account: Account
     session: str
     access_token: str
     cookie: str
     csrf: str
+    device_token: str
     expires_in_s: int = ACCESS_S
     cookie_s: int = SESSION_S
 
@@ -90,13 +104,25 @@ class Sessions:
             await change.store_pending()
             await self._tables.create(records.ACCOUNTS, row)
         csrf = new_secret()
+        device = Identity(account.id, "", await self.known_device(account.id, origin) or new_id())
         return SignedIn(
             account=account,
             session=session.id,
             access_token=await self._authenticator.issue(caller, API, ACCESS_S),
             cookie=await self._authenticator.issue(caller, SESSION, SESSION_S, csrf=csrf),
             csrf=csrf,
+            device_token=await self._authenticator.issue(device, DEVICE, DEVICE_S),
         )
+
+    async def known_device(self, account: str, origin: SignInOrigin) -> str:
+        """The id of a browser or program that has signed in to ``account`` before; empty if it is not known."""
+        if not origin.device_token:
+            return ""
+        try:
+            device = await self._authenticator.person(origin.device_token, DEVICE)
+        except Problem:
+            return ""
+        return device.session if device.account == account else ""
 
     async def access_token(self, caller: Identity) -> tuple[str, int]:
         """A new access token of a session and its lifetime [s], limited by the session."""

@@ -23,7 +23,8 @@ AGENTS = "Agents"
 CLAIMS = "Claims"
 """Partition: first letter of the code; key: the code."""
 ATTEMPTS = "Attempts"
-"""Partition: account id, ``name:<name>`` or ``address:<address>``; key: kind of secret."""
+"""Partition: account id, ``address:<address>``, ``session:<id>``, ``device:<id>`` (a known browser),
+``name:<hash of the name>`` or ``name:<hash>@<address>``; key: kind of secret."""
 MEMBERS = "Members"
 """Partition: account id; keys ``agent:<agent id>``, ``share:device:<id>``, ``share:space:<id>``. An index only: the
 rows of agents and shares decide."""

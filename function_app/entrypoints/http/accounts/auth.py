@@ -31,7 +31,8 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         """Returns an access token for programs and sets a cookie for the console."""
         reject_cross_site(request)
         payload: schemas.LinkSignInRequest = await read(request, schemas.LinkSignInRequest)
-        return signed_in(settings, await functions.sign_in.redeem(payload.link, sign_in_origin(request, settings)))
+        origin = sign_in_origin(request, settings, payload.device_token)
+        return signed_in(settings, await functions.sign_in.redeem(payload.link, origin))
 
     @routes.add(
         "POST /auth/password",
@@ -42,10 +43,15 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         caller="anonymous",
     )
     async def sign_in_by_password(request: Request) -> Response:
-        """Returns the same as a one-time link. Failed attempts are limited per name and per client address."""
+        """Returns the same as a one-time link.
+
+        Failed attempts are limited per name and client address, per client address, and per known browser. Many failed
+        attempts for one name delay further ones from unknown browsers.
+        """
         reject_cross_site(request)
         payload: schemas.PasswordSignInRequest = await read(request, schemas.PasswordSignInRequest)
-        done = await functions.passwords.sign_in(payload.name, payload.password, sign_in_origin(request, settings))
+        origin = sign_in_origin(request, settings, payload.device_token)
+        done = await functions.passwords.sign_in(payload.name, payload.password, origin)
         return signed_in(settings, done)
 
     @routes.add(

@@ -35,13 +35,15 @@ def signed_in(settings: Settings, done: SignedIn, status: int = 200) -> Response
         account=AccountRef(id=done.account.id, name=done.account.name),
         session=done.session,
         csrf_token=done.csrf,
+        device_token=done.device_token,
     )
     return json_response(body, status, {"Set-Cookie": set_session(settings, done), "Cache-Control": "no-store"})
 
 
-def sign_in_origin(request: Request, settings: Settings) -> SignInOrigin:
-    """Client address and user agent of a sign-in."""
-    return SignInOrigin(client_address(request, settings.trusted_proxies), request.headers.get("user-agent", ""))
+def sign_in_origin(request: Request, settings: Settings, device_token: str = "") -> SignInOrigin:
+    """Client address, user agent and device token of a sign-in."""
+    address = client_address(request, settings.trusted_proxies)
+    return SignInOrigin(address, request.headers.get("user-agent", ""), device_token)
 
 
 def _session(settings: Settings, value: str, lifetime_s: int) -> str:

@@ -8,10 +8,16 @@ from function_app.domain.identity.api_keys import MOST_DAYS, MOST_ONLY
 from function_app.entrypoints.http.framework.schemas import AccountRef, Moment, Name, Request, Response
 
 
+DeviceToken = Annotated[
+    str, Meta(max_length=2000, description="From an earlier sign-in of this browser or program; optional.")
+]
+
+
 class LinkSignInRequest(Request, frozen=True, kw_only=True):
     """The secret of a one-time link."""
 
     link: Annotated[str, Meta(min_length=1, max_length=200)]
+    device_token: DeviceToken = ""
 
 
 NewPassword = Annotated[
@@ -24,6 +30,7 @@ class PasswordSignInRequest(Request, frozen=True, kw_only=True):
 
     name: Name
     password: Annotated[str, Meta(min_length=1, max_length=1000)]
+    device_token: DeviceToken = ""
 
 
 class PasswordRequest(Request, frozen=True, kw_only=True):
@@ -42,7 +49,10 @@ class AccountRequest(Request, frozen=True, kw_only=True):
 
 
 class SignedIn(Response, frozen=True, kw_only=True):
-    """A new sign-in session."""
+    """A new sign-in session.
+
+    ``device_token``: send it with the next sign-in. It marks a known browser, whose limit of wrong passwords is its own.
+    """
 
     access_token: str
     token_type: Literal["Bearer"]
@@ -50,6 +60,7 @@ class SignedIn(Response, frozen=True, kw_only=True):
     account: AccountRef
     session: str
     csrf_token: str
+    device_token: str
 
 
 class OidcProviderOut(Response, frozen=True, kw_only=True):

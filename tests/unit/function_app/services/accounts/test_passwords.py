@@ -10,6 +10,7 @@ from argon2 import PasswordHasher
 from function_app.adapters.local import password_hasher
 from function_app.domain.common.problems import Problem
 from function_app.ports.tables import Row
+from function_app.services.accounts import passwords
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import API, Cloud, Person, problem
@@ -19,8 +20,8 @@ PASSWORD = "/accounts/me/password"
 SESSIONS = "/accounts/me/sessions"
 
 
-def sign_in(cloud: Cloud, name: str, password: str, *, address: str = "127.0.0.1") -> httpx.Response:
-    body = {"name": name, "password": password}
+def sign_in(cloud: Cloud, name: str, password: str, *, address: str = "127.0.0.1", **more: str) -> httpx.Response:
+    body = {"name": name, "password": password, **more}
     return cloud.run(cloud.client(address=address).post(f"{API}/auth/password", json=body))
 
 
@@ -124,20 +125,60 @@ class TestNames:
 
 
 class TestGuessing:
-    def test_ten_wrong_passwords_block_a_name_in_every_spelling(self, cloud: Cloud, anna: Person) -> None:
+    def test_ten_wrong_passwords_block_a_name_at_one_address_only(self, cloud: Cloud, anna: Person) -> None:
         for number in range(9):
             name = "".join(letter.upper() if number >> place & 1 else letter for place, letter in enumerate("anna"))
-            problem(sign_in(cloud, name, "wrong", address=f"192.0.2.{number}"), 401, "unauthorized")
-        for _ in range(2):
-            assert sign_in(cloud, "anna", GOOD).status_code == 200, "a correct password does not count"
-        problem(sign_in(cloud, "anna", "wrong"), 401, "unauthorized")
-        answer = sign_in(cloud, "anna", GOOD, address="192.0.2.77")
+            problem(sign_in(cloud, name, "wrong", address="192.0.2.1"), 401, "unauthorized")
+        assert sign_in(cloud, "anna", GOOD, address="192.0.2.1").status_code == 200, "a correct one does not count"
+        problem(sign_in(cloud, "anna", "wrong", address="192.0.2.1"), 401, "unauthorized")
+        answer = sign_in(cloud, "anna", GOOD, address="192.0.2.1")
         problem(answer, 429, "too-many-tries")
         assert 0 < int(answer.headers["retry-after"]) <= 300
+        assert sign_in(cloud, "anna", GOOD, address="192.0.2.2").status_code == 200, "the owner at another address"
         assert anna.get("/accounts/me").status_code == 200
-        assert cloud.sign_in("anna").get("/accounts/me").status_code == 200, "by a link"
         cloud.clock.advance(301)
-        assert sign_in(cloud, "anna", GOOD).status_code == 200
+        assert sign_in(cloud, "anna", GOOD, address="192.0.2.1").status_code == 200
+
+    @pytest.mark.usefixtures("anna")
+    def test_attempts_from_many_addresses_slow_the_account_without_locking_it(
+        self, cloud: Cloud, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Each attempt costs a slow hash, so the test lowers the limit."""
+        monkeypatch.setattr(passwords, "SLOW_AFTER", 4)
+        monkeypatch.setattr(passwords, "SLOWER_S", 1.5)
+        known = sign_in(cloud, "anna", GOOD).json()["device_token"]
+
+        def duration_s(password: str, status: int, address: str, **more: str) -> float:
+            before_ms = cloud.clock.now_ms()
+            assert sign_in(cloud, "anna", password, address=address, **more).status_code == status
+            return (cloud.clock.now_ms() - before_ms) / 1000
+
+        delays_s = [duration_s("wrong", 401, f"192.0.2.{number}") for number in range(8)]
+        assert delays_s == pytest.approx([0, 0, 0, 0, 1.5, 3, 4, 4], abs=0.1)
+        assert duration_s(GOOD, 200, "203.0.113.1") == pytest.approx(4, abs=0.1)
+        assert duration_s(GOOD, 200, "203.0.113.1", device_token=known) < 0.1, "a known browser is not slowed"
+
+    @pytest.mark.usefixtures("anna")
+    def test_a_known_browser_has_its_own_limit(self, cloud: Cloud) -> None:
+        known = sign_in(cloud, "anna", GOOD).json()["device_token"]
+        for number in range(31):
+            sign_in(cloud, f"n{number}", "wrong")
+        problem(sign_in(cloud, "anna", GOOD), 429, "too-many-tries")
+        assert sign_in(cloud, "anna", GOOD, device_token=known).status_code == 200
+        for _ in range(10):
+            problem(sign_in(cloud, "anna", "wrong", device_token=known), 401, "unauthorized")
+        problem(sign_in(cloud, "anna", GOOD, device_token=known), 429, "too-many-tries")
+
+    @pytest.mark.usefixtures("anna")
+    def test_the_token_of_another_account_is_not_a_known_browser(self, cloud: Cloud) -> None:
+        bert = cloud.sign_in("bert")
+        assert bert.put(PASSWORD, {"password": BETTER}).status_code == 204
+        other = sign_in(cloud, "bert", BETTER).json()["device_token"]
+        for token in (other, "forged", bert.token):
+            for _ in range(3):
+                sign_in(cloud, "anna", "wrong", device_token=token)
+        problem(sign_in(cloud, "anna", "wrong", device_token=other), 401, "unauthorized")
+        problem(sign_in(cloud, "anna", GOOD, device_token=other), 429, "too-many-tries")
 
     @pytest.mark.usefixtures("anna")
     def test_an_address_has_thirty_attempts_over_all_names(self, cloud: Cloud) -> None:
