@@ -85,7 +85,13 @@ def create_app(functions: Functions) -> FastAPI:
         lifespan=lifespan,
         redirect_slashes=False,
     )
-    authenticator = RequestAuthenticator(functions.authenticator, functions.api_keys, functions.rate_limiter)
+    authenticator = RequestAuthenticator(
+        functions.authenticator,
+        functions.api_keys,
+        functions.sessions,
+        functions.rate_limiter,
+        trusted_proxies=functions.settings.trusted_proxies,
+    )
     resources: list[Routes] = [module.router(functions, authenticator) for module in _MODULES]
     routers = [*(routes.router for routes in resources), blob_transfers.router(functions.transfers)]
     index = RouteIndex(route for router in routers for route in router.routes if isinstance(route, APIRoute))

@@ -13,7 +13,7 @@ from function_app.ports.tables import Conflict, Page, Row, Tables, Write
 
 ACCOUNTS = "Accounts"
 """Partition: account id (or ``name:<name>``, ``open-id:<hash>``); keys ``account``, ``space:<id>``, ``session:<id>``,
-``signed-out:<session>``, ``password``."""
+``signed-out:<session>``, ``sign-in:<counts down with time>:<session>``, ``password``, ``second-factor``."""
 SIGN_INS = "SignIns"
 """Partition: first letter of the token's hash; key: the hash."""
 API_KEYS = "ApiKeys"

@@ -6,7 +6,7 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.problems import forbidden
 from function_app.domain.identity.accounts import Identity
 from function_app.entrypoints.http.accounts import schemas
-from function_app.entrypoints.http.accounts.cookies import clear_session, sign_in_origin, signed_in
+from function_app.entrypoints.http.accounts.cookies import clear_session, signed_in
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, reject_cross_site
 from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
@@ -31,7 +31,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         """Returns an access token for programs and sets a cookie for the console."""
         reject_cross_site(request)
         payload: schemas.LinkSignInRequest = await read(request, schemas.LinkSignInRequest)
-        origin = sign_in_origin(request, settings, payload.device_token)
+        origin = auth.origin(request, payload.device_token)
         return signed_in(settings, await functions.sign_in.redeem(payload.link, origin))
 
     @routes.add(
@@ -50,7 +50,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         """
         reject_cross_site(request)
         payload: schemas.PasswordSignInRequest = await read(request, schemas.PasswordSignInRequest)
-        origin = sign_in_origin(request, settings, payload.device_token)
+        origin = auth.origin(request, payload.device_token)
         done = await functions.passwords.sign_in(payload.name, payload.password, origin)
         return signed_in(settings, done)
 
@@ -73,7 +73,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         if invitation.invitation.account:
             raise forbidden("This invitation is for an existing account. Sign in with that account to redeem it.")
         account = await functions.passwords.register(payload.name, payload.password)
-        done = await functions.sessions.begin(account, "password", sign_in_origin(request, settings))
+        done = await functions.sessions.begin(account, "password", auth.origin(request))
         await functions.invitations.redeem(Identity(account.id, account.name, done.session), invitation)
         return signed_in(settings, done, 201)
 

@@ -1,13 +1,12 @@
 """The session cookie, and the response to a sign-in."""
 
-from fastapi import Request, Response
+from fastapi import Response
 
 from function_app.entrypoints.http.accounts import schemas
 from function_app.entrypoints.http.framework.authentication import COOKIE
-from function_app.entrypoints.http.framework.client_address import client_address
 from function_app.entrypoints.http.framework.responses import json_response
 from function_app.entrypoints.http.framework.schemas import AccountRef
-from function_app.services.identity.sessions import SignedIn, SignInOrigin
+from function_app.services.identity.sessions import SignedIn
 from function_app.settings import Settings
 
 
@@ -38,12 +37,6 @@ def signed_in(settings: Settings, done: SignedIn, status: int = 200) -> Response
         device_token=done.device_token,
     )
     return json_response(body, status, {"Set-Cookie": set_session(settings, done), "Cache-Control": "no-store"})
-
-
-def sign_in_origin(request: Request, settings: Settings, device_token: str = "") -> SignInOrigin:
-    """Client address, user agent and device token of a sign-in."""
-    address = client_address(request, settings.trusted_proxies)
-    return SignInOrigin(address, request.headers.get("user-agent", ""), device_token)
 
 
 def _session(settings: Settings, value: str, lifetime_s: int) -> str:

@@ -5,7 +5,6 @@ from fastapi import Request, Response
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.accounts import schemas
-from function_app.entrypoints.http.accounts.cookies import sign_in_origin
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, bearer
 from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
@@ -41,7 +40,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         """
         caller = await auth.account(request)
         payload: schemas.PasswordRequest = await read(request, schemas.PasswordRequest)
-        origin = sign_in_origin(request, functions.settings)
+        origin = auth.origin(request)
         await functions.passwords.put(caller, payload.password, old=payload.old_password, origin=origin)
         return empty()
 
@@ -54,6 +53,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
                 id=each.id,
                 method=each.how,
                 created_at=rfc3339(each.since_ms),
+                last_used_at=rfc3339(each.used_ms or each.since_ms),
                 expires_at=rfc3339(each.expires_ms),
                 address=each.address,
                 program=each.program,
@@ -62,6 +62,24 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             for each in await functions.sessions.list(caller.account)
         )
         return json_response(schemas.SessionList(items=items, cursor=None))
+
+    @routes.add("GET /accounts/me/sign-ins", "List recent sign-ins", schemas.SignInList)
+    async def list_sign_ins(request: Request) -> Response:
+        """Returns past sign-ins, also of ended sessions. No session can remove them; they expire after 30 days."""
+        caller = await auth.account(request)
+        items = tuple(
+            schemas.SignInOut(
+                session=each.session,
+                method=each.how,
+                at=rfc3339(each.at_ms),
+                address=each.address,
+                program=each.program,
+                known_browser=each.known_browser,
+                mine=each.session == caller.session,
+            )
+            for each in await functions.sessions.sign_ins(caller.account)
+        )
+        return json_response(schemas.SignInList(items=items, cursor=None))
 
     @routes.add("DELETE /accounts/me/sessions", "End all other sessions", schemas.SessionsEnded)
     async def end_other_sessions(request: Request) -> Response:

@@ -7,7 +7,7 @@ from fastapi import Query, Request, Response
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem
 from function_app.entrypoints.http.accounts import schemas
-from function_app.entrypoints.http.accounts.cookies import secure, set_session, sign_in_origin
+from function_app.entrypoints.http.accounts.cookies import secure, set_session
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, reject_cross_site
 from function_app.entrypoints.http.framework.responses import json_response, read
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
@@ -20,7 +20,7 @@ _FAILED = "/#sign-in-failed="
 Value = Annotated[str, Query(max_length=4000)]
 
 
-def router(functions: Functions, _auth: RequestAuthenticator) -> Routes:
+def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     """The routes."""
     routes = Routes("accounts")
     settings = functions.settings
@@ -74,7 +74,7 @@ def router(functions: Functions, _auth: RequestAuthenticator) -> Routes:
         """
         returned = OidcCallback(state, code, request.cookies.get(COOKIE, ""), iss, error)
         try:
-            done = await functions.oidc_sign_in.finish(returned, sign_in_origin(request, settings))
+            done = await functions.oidc_sign_in.finish(returned, auth.origin(request))
         except Problem as problem:
             if not problem.code.startswith("oidc-") or problem.code == "oidc-unknown":
                 raise

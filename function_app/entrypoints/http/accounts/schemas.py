@@ -7,7 +7,6 @@ from msgspec import Meta
 from function_app.domain.identity.api_keys import MOST_DAYS, MOST_ONLY
 from function_app.entrypoints.http.framework.schemas import AccountRef, Moment, Name, Request, Response
 
-
 DeviceToken = Annotated[
     str, Meta(max_length=2000, description="From an earlier sign-in of this browser or program; optional.")
 ]
@@ -51,7 +50,8 @@ class AccountRequest(Request, frozen=True, kw_only=True):
 class SignedIn(Response, frozen=True, kw_only=True):
     """A new sign-in session.
 
-    ``device_token``: send it with the next sign-in. It marks a known browser, whose limit of wrong passwords is its own.
+    ``device_token``: send it with the next sign-in. It marks a known browser, which has its own limit of wrong
+    passwords.
     """
 
     access_token: str
@@ -118,11 +118,15 @@ class AccountOut(Response, frozen=True, kw_only=True):
 
 
 class SessionOut(Response, frozen=True, kw_only=True):
-    """A sign-in session. ``mine``: the session of this request."""
+    """A sign-in session. ``mine``: the session of this request.
+
+    ``address`` and ``program`` (user agent): of the last use. ``last_used_at`` has a resolution of five minutes.
+    """
 
     id: str
     method: Literal["link", "password", "oidc"]
     created_at: Moment
+    last_used_at: Moment
     expires_at: Moment
     address: str
     program: str
@@ -133,6 +137,25 @@ class SessionList(Response, frozen=True, kw_only=True):
     """Active sign-in sessions, newest first."""
 
     items: tuple[SessionOut, ...]
+    cursor: str | None
+
+
+class SignInOut(Response, frozen=True, kw_only=True):
+    """A past sign-in. ``known_browser``: it had signed in before. ``mine``: it began the session of this request."""
+
+    session: str
+    method: Literal["link", "password", "oidc"]
+    at: Moment
+    address: str
+    program: str
+    known_browser: bool
+    mine: bool
+
+
+class SignInList(Response, frozen=True, kw_only=True):
+    """The newest sign-ins of the last 30 days, at most 50, newest first."""
+
+    items: tuple[SignInOut, ...]
     cursor: str | None
 
 

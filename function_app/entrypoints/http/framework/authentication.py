@@ -9,10 +9,12 @@ from function_app.domain.common.problems import Problem, forbidden, unauthorized
 from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.identity.api_keys import PREFIX as KEY_PREFIX
+from function_app.entrypoints.http.framework.client_address import client_address
 from function_app.entrypoints.http.framework.routing import takes_keys
 from function_app.services.accounts.api_keys import ApiKeys
 from function_app.services.identity.authenticator import API, Authenticator
 from function_app.services.identity.rate_limiter import RateLimiter
+from function_app.services.identity.sessions import Sessions, SignInOrigin
 
 COOKIE = "telescope_session"
 CSRF_HEADER = "X-CSRF-Token"
@@ -25,10 +27,20 @@ _SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 class RequestAuthenticator:
     """Authenticates requests and applies rate limits per caller."""
 
-    def __init__(self, authenticator: Authenticator, api_keys: ApiKeys, limits: RateLimiter) -> None:
+    def __init__(
+        self,
+        authenticator: Authenticator,
+        api_keys: ApiKeys,
+        sessions: Sessions,
+        limits: RateLimiter,
+        *,
+        trusted_proxies: int,
+    ) -> None:
         self._authenticator = authenticator
         self._api_keys = api_keys
+        self._sessions = sessions
         self._limits = limits
+        self._trusted_proxies = trusted_proxies
 
     async def account(self, request: Request) -> Identity:
         """The account of the caller: a person or an API key.
@@ -49,7 +61,14 @@ class RequestAuthenticator:
         request.scope[AUTHENTICATED] = True
         if not is_stop(request):
             self._limits.admit("key" if caller.key else "account", caller.key or caller.account)
+            if self._sessions.use_is_due(caller):
+                await self._sessions.note_use(caller, self.origin(request))
         return caller
+
+    def origin(self, request: Request, device_token: str = "") -> SignInOrigin:
+        """Client address, user agent and device token of a sign-in."""
+        address = client_address(request, self._trusted_proxies)
+        return SignInOrigin(address, request.headers.get("user-agent", ""), device_token)
 
     async def page(self, request: Request) -> tuple[Identity, str]:
         """The account of the session cookie, and the session's CSRF token.

@@ -230,6 +230,43 @@ class TestSessions:
         assert (first["id"], first["method"], first["mine"]) == (anna.session, "link", True)
         assert cloud.sign_in("bert").get(SESSIONS).json()["items"][0]["method"] == "link"
 
+    def test_the_last_use_is_listed_with_address_and_program(self, cloud: Cloud, anna: Person) -> None:
+        phone = cloud.sign_in("anna", address="192.0.2.9")
+
+        def listed() -> Any:
+            return {each["id"]: each for each in anna.get(SESSIONS).json()["items"]}[phone.session]
+
+        signed_in = listed()
+        assert signed_in["last_used_at"] == signed_in["created_at"]
+        cloud.clock.advance(360)
+        assert phone.get("/accounts/me", headers={"User-Agent": "Phone"}).status_code == 200
+        used = listed()
+        assert (used["address"], used["program"]) == ("192.0.2.9", "Phone")
+        assert signed_in["last_used_at"] < used["last_used_at"] < used["expires_at"]
+        cloud.clock.advance(60)
+        phone.get("/accounts/me")
+        assert listed() == used, "the resolution is five minutes"
+
+    def test_recent_sign_ins_outlive_their_sessions(self, cloud: Cloud, anna: Person) -> None:
+        first = sign_in(cloud, "anna", GOOD, address="192.0.2.9").json()
+        second = Person(cloud, sign_in(cloud, "anna", GOOD, device_token=first["device_token"]).json())
+        assert second.delete(f"{SESSIONS}/{first['session']}").status_code == 204
+        items = anna.get("/accounts/me/sign-ins").json()["items"]
+        assert [(each["session"], each["method"], each["known_browser"], each["mine"]) for each in items] == [
+            (second.session, "password", True, False),
+            (first["session"], "password", False, False),
+            (anna.session, "link", False, True),
+        ]
+        assert (items[1]["address"], items[1]["program"][:12]) == ("192.0.2.9", "python-httpx")
+        record = anna.get("/accounts/me/audit", params={"event": "signed-in"}).json()["items"][1]
+        assert record["at"] == items[1]["at"]
+        assert record["data"] == {
+            "how": "password", "address": "192.0.2.9", "program": items[1]["program"], "known_browser": False,
+        }  # fmt: skip
+        cloud.clock.advance(30 * 86_400)
+        newest = cloud.sign_in("anna")
+        assert [each["mine"] for each in newest.get("/accounts/me/sign-ins").json()["items"]] == [True]
+
     def test_an_account_ends_its_own_sessions(self, cloud: Cloud, anna: Person) -> None:
         ended, *others = [cloud.sign_in("anna") for _ in range(3)]
         stranger = cloud.sign_in("bert")
