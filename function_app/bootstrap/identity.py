@@ -6,6 +6,7 @@ from function_app.bootstrap.audit import AuditServices
 from function_app.services.identity.authenticator import Authenticator
 from function_app.services.identity.guess_limiter import GuessLimiter
 from function_app.services.identity.rate_limiter import RateLimiter
+from function_app.services.identity.second_factor import SecondFactor
 from function_app.services.identity.sessions import Sessions
 from function_app.services.identity.sign_in import SignIn
 
@@ -28,8 +29,20 @@ class IdentityServices(AuditServices):
         )
 
     @cached_property
+    def second_factor(self) -> SecondFactor:
+        return SecondFactor(
+            tables=self.tables, guess_limiter=self.guess_limiter, audit_log=self.audit_log, clock=self.clock
+        )
+
+    @cached_property
     def sign_in(self) -> SignIn:
-        return SignIn(tables=self.tables, sessions=self.sessions, audit_log=self.audit_log, clock=self.clock)
+        return SignIn(
+            tables=self.tables,
+            sessions=self.sessions,
+            second_factor=self.second_factor,
+            audit_log=self.audit_log,
+            clock=self.clock,
+        )
 
     @cached_property
     def guess_limiter(self) -> GuessLimiter:

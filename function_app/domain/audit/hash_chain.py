@@ -33,6 +33,9 @@ class AccountEvent(StrEnum):
     SIGNED_OUT = "signed-out"
     ACCOUNT_MADE = "account-made"
     PASSWORD_SET = "password-set"  # noqa: S105 (an event, not a password)
+    SECOND_FACTOR_ENABLED = "second-factor-enabled"
+    SECOND_FACTOR_DISABLED = "second-factor-disabled"
+    RECOVERY_CODES_MADE = "recovery-codes-made"
     API_KEY_MADE = "api-key-made"
     API_KEY_REVOKED = "api-key-revoked"
     SIGNING_KEY_ROTATED = "signing-key-rotated"

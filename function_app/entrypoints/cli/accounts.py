@@ -16,6 +16,11 @@ def add_commands(commands: Any) -> None:
     text = "print a one-time sign-in link; creates the account if it does not exist"
     link = commands.add_parser("sign-in-link", help=text, description=text)
     link.add_argument("--account", default="demo", help="name of the account (default: %(default)s)")
+    link.add_argument(
+        "--remove-second-factor",
+        action="store_true",
+        help="remove the account's second factor, after the loss of its app and recovery codes",
+    )
     link.set_defaults(run=with_functions(_sign_in_link))
     text = "print a new API key of an account, for another program"
     key = commands.add_parser("api-key", help=text, description=text)
@@ -31,6 +36,11 @@ def add_commands(commands: Any) -> None:
 
 async def _sign_in_link(functions: Functions, options: argparse.Namespace) -> None:
     account = await functions.sign_in.account(options.account)
+    if options.remove_second_factor:
+        try:
+            await functions.second_factor.remove(account)
+        except Problem as problem:
+            raise SettingsError(problem.detail) from problem
     print(f"{functions.settings.public_url}/#sign-in={await functions.sign_in.link(account)}")
 
 

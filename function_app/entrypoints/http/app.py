@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem, invalid, store_unavailable
-from function_app.entrypoints.http.accounts import api_keys, audit, auth, me, oidc
+from function_app.entrypoints.http.accounts import api_keys, audit, auth, me, oidc, second_factor
 from function_app.entrypoints.http.actions import actions, many, stop
 from function_app.entrypoints.http.console import Console
 from function_app.entrypoints.http.control import lease, mqtt_credentials
@@ -55,8 +55,9 @@ from function_app.services.identity.rate_limiter import RateLimiter
 _SECURE_FOR = b"max-age=31536000"
 """One year [s]: browsers that used TLS once use only TLS."""
 _MODULES = (
-    auth, me, oidc, api_keys, agents, polling, audit, devices, device_library, sharing, lease, stop, actions, many,
-    robot_types, agent_packages, previews, movements, script_editor, mqtt_credentials, xmpp, latency, faults, events,
+    auth, me, second_factor, oidc, api_keys, agents, polling, audit, devices, device_library, sharing, lease, stop,
+    actions, many, robot_types, agent_packages, previews, movements, script_editor, mqtt_credentials, xmpp, latency,
+    faults, events,
     diagnostics, series, uploads, health_check,
 )  # fmt: skip
 """In the order of the OpenAPI document."""

@@ -69,8 +69,11 @@ class Passwords:
         self._audit_log = audit_log
         self._clock = clock
 
-    async def sign_in(self, name: str, password: str, origin: SignInOrigin) -> SignedIn:
-        """Sign in. For unknown names, time and response are the same. Raises ``unauthorized`` or ``too-many-tries``."""
+    async def sign_in(self, name: str, password: str, origin: SignInOrigin, code: str = "") -> SignedIn:
+        """Sign in, with ``code`` if the account has a second factor. For unknown names, time and response are the same.
+
+        Raises ``unauthorized``, ``second-factor-required``, ``second-factor-wrong`` or ``too-many-tries``.
+        """
         account_of_name = await self._sign_in.known(name)
         account = account_of_name.id if account_of_name else ""
         counters = _counters(name, origin.address, await self._sessions.known_device(account, origin))
@@ -86,7 +89,8 @@ class Passwords:
             await self._refused(account, origin, WRONG)
             raise unauthorized("Name or password is wrong.")
         await self._guess_limiter.remove_failure(GUESS, counters)
-        signed_in = await self._sessions.begin(account_of_name, "password", origin)
+        used = await self._sign_in.check_second_factor(account, code, origin)
+        signed_in = await self._sessions.begin(account_of_name, "password", origin, second_factor=used)
         current = await self._tables.get(records.ACCOUNTS, account, _PASSWORD)
         if current is None or records.read(current, _Stored) != stored:
             # A concurrent password change has ended all earlier sessions, but not this one.
@@ -103,12 +107,7 @@ class Passwords:
         not sufficient to take over the account.
         Raises ``password-not-managed-here``, ``forbidden``, ``password-weak`` or ``too-many-tries``.
         """
-        account_of_name = await self._sign_in.known(caller.name)
-        if account_of_name is None or account_of_name.id != caller.account:
-            detail = "This account signs in with a provider and has no password here. Change it at the provider."
-            raise Problem("password-not-managed-here", 409, "No local password", detail)
-        row = await self._tables.get(records.ACCOUNTS, caller.account, _PASSWORD)
-        await self._require_right(caller, row, old, origin)
+        row = await self.prove(caller, old, origin)
         data = records.to_data(await self._store(password, caller.name))
         async with self._audit_log.change(
             caller.account, AccountEvent.PASSWORD_SET, caller, address=origin.address
@@ -123,6 +122,19 @@ class Passwords:
                 detail = "The password was changed concurrently. Use the new one as the old password."
                 raise forbidden(detail) from conflict
         await self._sign_out.others(caller)
+
+    async def prove(self, caller: Identity, password: str | None, origin: SignInOrigin) -> Row | None:
+        """Require the password of the caller's local account, or a recent sign-in by link; return the password's row.
+
+        Raises ``password-not-managed-here``, ``forbidden`` or ``too-many-tries``.
+        """
+        account_of_name = await self._sign_in.known(caller.name)
+        if account_of_name is None or account_of_name.id != caller.account:
+            detail = "This account signs in with a provider and has no password here. Change it at the provider."
+            raise Problem("password-not-managed-here", 409, "No local password", detail)
+        row = await self._tables.get(records.ACCOUNTS, caller.account, _PASSWORD)
+        await self._require_right(caller, row, password, origin)
+        return row
 
     async def register(self, name: str, password: str) -> Account:
         """Create a local account. The password is written before the name, so that no name exists without a password.
@@ -161,14 +173,14 @@ class Passwords:
             session = await self._sessions.get(caller)
             if session is None or not session.fresh_by_link(self._clock.now_ms()):
                 raise forbidden(
-                    "Enter the old password, or use a new one-time link and set the password within 10 minutes."
+                    "Enter your current password, or sign in with a new one-time link and repeat this in 10 minutes."
                 )
             return
         counters = {f"session:{caller.session}": WRONG_TRIES}
         await self._guess_limiter.add_failure(GUESS, counters)
         if not await self._hasher.check(records.read(row, _Stored).hash if row else None, normalize(old)):
             await self._refused(caller.account, origin, WRONG)
-            raise forbidden("The old password is wrong.")
+            raise forbidden("The current password is wrong.")
         await self._guess_limiter.remove_failure(GUESS, counters)
 
     async def _store(self, password: str, name: str) -> _Stored:

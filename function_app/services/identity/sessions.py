@@ -125,8 +125,8 @@ class Sessions:
         self._clock = clock
         self._used_ms: OrderedDict[str, int] = OrderedDict()
 
-    async def begin(self, account: Account, how: How, origin: SignInOrigin) -> SignedIn:
-        """Create a session for an authenticated account."""
+    async def begin(self, account: Account, how: How, origin: SignInOrigin, *, second_factor: str = "") -> SignedIn:
+        """Create a session for an authenticated account. ``second_factor``: the used one, for the audit log."""
         now_ms = self._clock.now_ms()
         ends_ms = now_ms + SESSION_S * 1000
         address, program = origin.address, origin.program[:_SHOWN]
@@ -142,6 +142,7 @@ class Sessions:
             address=address,
             program=program,
             known_browser=bool(known),
+            second_factor=second_factor,
         ) as change:
             await change.store_pending()
             await self._store(account.id, _ROW + session.id, session)

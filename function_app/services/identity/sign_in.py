@@ -10,6 +10,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.identity.authenticator import new_secret
+from function_app.services.identity.second_factor import SecondFactor, Used, sign_in_counter
 from function_app.services.identity.sessions import Sessions, SignedIn, SignInOrigin
 from function_app.services.storage import records
 
@@ -23,9 +24,12 @@ MOST_SPACES = 100
 class SignIn:
     """Accounts and their one-time links."""
 
-    def __init__(self, *, tables: Tables, sessions: Sessions, audit_log: AuditLog, clock: Clock) -> None:
+    def __init__(
+        self, *, tables: Tables, sessions: Sessions, second_factor: SecondFactor, audit_log: AuditLog, clock: Clock
+    ) -> None:
         self._tables = tables
         self._sessions = sessions
+        self._second_factor = second_factor
         self._audit_log = audit_log
         self._clock = clock
 
@@ -107,29 +111,39 @@ class SignIn:
         await self._tables.create(records.SIGN_INS, Row(hashed[0], hashed, data))
         return token
 
-    async def redeem(self, token: str, origin: SignInOrigin | None = None) -> SignedIn:
-        """Sign in with a one-time token. Of concurrent requests one succeeds: the one that deletes the row.
+    async def redeem(self, token: str, origin: SignInOrigin | None = None, code: str = "") -> SignedIn:
+        """Sign in with a one-time token, and ``code`` if the account has a second factor.
+
+        Of concurrent requests one succeeds: the one that deletes the row. A wrong code does not use up the token.
 
         Raises:
-            Problem: ``unauthorized``: unknown, used or expired; the response is the same.
+            Problem: ``unauthorized``: unknown, used or expired; the response is the same; ``second-factor-required``,
+                ``second-factor-wrong``, ``too-many-tries``.
         """
+        origin = origin or SignInOrigin()
         hashed = _hash(token)
         refused = unauthorized("This sign-in link is unknown, used or expired. Request a new one.")
         row = await self._tables.get(records.SIGN_INS, hashed[0], hashed)
         if row is None:
-            address = origin.address if origin else ""
             await self._audit_log.record_rejection(
-                CLOUD, AccountEvent.SIGN_IN_REJECTED, None, code="link-unknown", address=address
+                CLOUD, AccountEvent.SIGN_IN_REJECTED, None, code="link-unknown", address=origin.address
             )
             raise refused
+        account = Account(id=row.data["account"], name=row.data["name"])
+        expired = self._clock.now_ms() >= row.data["expires_ms"]
+        used: Used = "" if expired else await self.check_second_factor(account.id, code, origin)
         try:
             await self._tables.delete(records.SIGN_INS, row)
         except Conflict as conflict:
             raise refused from conflict
-        if self._clock.now_ms() >= row.data["expires_ms"]:
+        if expired:
             raise refused
-        account = Account(id=row.data["account"], name=row.data["name"])
-        return await self._sessions.begin(account, "link", origin or SignInOrigin())
+        return await self._sessions.begin(account, "link", origin, second_factor=used)
+
+    async def check_second_factor(self, account: str, code: str, origin: SignInOrigin) -> Used:
+        """Check the second factor of a sign-in. Raises like ``SecondFactor.check``."""
+        device = await self._sessions.known_device(account, origin)
+        return await self._second_factor.check(account, code, origin, counter=sign_in_counter(account, device))
 
     async def _named(self, name: str) -> Row | None:
         """Older rows are stored under their exact spelling, which is looked up first."""

@@ -28,11 +28,14 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         caller="anonymous",
     )
     async def sign_in(request: Request) -> Response:
-        """Returns an access token for programs and sets a cookie for the console."""
+        """Returns an access token for programs and sets a cookie for the console.
+
+        ``second-factor-required``: repeat the request with ``code``. A wrong code does not use up the link.
+        """
         reject_cross_site(request)
         payload: schemas.LinkSignInRequest = await read(request, schemas.LinkSignInRequest)
         origin = auth.origin(request, payload.device_token)
-        return signed_in(settings, await functions.sign_in.redeem(payload.link, origin))
+        return signed_in(settings, await functions.sign_in.redeem(payload.link, origin, payload.code))
 
     @routes.add(
         "POST /auth/password",
@@ -43,7 +46,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         caller="anonymous",
     )
     async def sign_in_by_password(request: Request) -> Response:
-        """Returns the same as a one-time link.
+        """Returns the same as a one-time link, and requires ``code`` in the same way.
 
         Failed attempts are limited per name and client address, per client address, and per known browser. Many failed
         attempts for one name delay further ones from unknown browsers.
@@ -51,7 +54,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         reject_cross_site(request)
         payload: schemas.PasswordSignInRequest = await read(request, schemas.PasswordSignInRequest)
         origin = auth.origin(request, payload.device_token)
-        done = await functions.passwords.sign_in(payload.name, payload.password, origin)
+        done = await functions.passwords.sign_in(payload.name, payload.password, origin, payload.code)
         return signed_in(settings, done)
 
     @routes.add(

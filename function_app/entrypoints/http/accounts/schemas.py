@@ -11,12 +11,16 @@ DeviceToken = Annotated[
     str, Meta(max_length=2000, description="From an earlier sign-in of this browser or program; optional.")
 ]
 
+Code = Annotated[str, Meta(max_length=40, description="Code of the authenticator app, or a recovery code.")]
+CurrentPassword = Annotated[str, Meta(max_length=1000)]
+
 
 class LinkSignInRequest(Request, frozen=True, kw_only=True):
-    """The secret of a one-time link."""
+    """The secret of a one-time link. ``code``: for an account with a second factor."""
 
     link: Annotated[str, Meta(min_length=1, max_length=200)]
     device_token: DeviceToken = ""
+    code: Code = ""
 
 
 NewPassword = Annotated[
@@ -25,18 +29,53 @@ NewPassword = Annotated[
 
 
 class PasswordSignInRequest(Request, frozen=True, kw_only=True):
-    """Name and password of a local account."""
+    """Name and password of a local account. ``code``: for an account with a second factor."""
 
     name: Name
     password: Annotated[str, Meta(min_length=1, max_length=1000)]
     device_token: DeviceToken = ""
+    code: Code = ""
 
 
 class PasswordRequest(Request, frozen=True, kw_only=True):
     """A new password."""
 
     password: NewPassword
-    old_password: Annotated[str, Meta(max_length=1000)] | None = None
+    old_password: CurrentPassword | None = None
+
+
+class SecondFactorRequest(Request, frozen=True, kw_only=True):
+    """The current password. Not required within 10 minutes of a sign-in by one-time link."""
+
+    password: CurrentPassword | None = None
+
+
+class SecondFactorCode(Request, frozen=True, kw_only=True):
+    """A code that confirms the change."""
+
+    code: Annotated[str, Meta(min_length=1, max_length=40)]
+
+
+class SecondFactorOut(Response, frozen=True, kw_only=True):
+    """The second factor. ``recovery_codes``: number of unused recovery codes."""
+
+    enabled: bool
+    enabled_at: Moment | None
+    recovery_codes: int
+
+
+class SecondFactorSecret(Response, frozen=True, kw_only=True):
+    """A new secret for an authenticator app. ``qr``: the QR code of ``otpauth_uri``; each row has ``1`` for black."""
+
+    secret: str
+    otpauth_uri: str
+    qr: tuple[str, ...]
+
+
+class RecoveryCodes(Response, frozen=True, kw_only=True):
+    """New recovery codes; returned only once. Each replaces one code of the app."""
+
+    recovery_codes: tuple[str, ...]
 
 
 class AccountRequest(Request, frozen=True, kw_only=True):

@@ -262,6 +262,7 @@ class TestSessions:
         assert record["at"] == items[1]["at"]
         assert record["data"] == {
             "how": "password", "address": "192.0.2.9", "program": items[1]["program"], "known_browser": False,
+            "second_factor": "",
         }  # fmt: skip
         cloud.clock.advance(30 * 86_400)
         newest = cloud.sign_in("anna")
