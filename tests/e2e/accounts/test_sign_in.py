@@ -2,10 +2,12 @@
 
 from collections.abc import Iterator
 
+import pyotp
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from tests.harness.browser.browser import person
+from tests.harness.browser.pages import assert_good_page
 from tests.harness.cloud.oidc_provider import CLIENT_ID, CLIENT_SECRET, new_key, start_provider
 from tests.harness.cloud.people import sign_in_link
 from tests.harness.hosts.host import environment_of, start_program
@@ -69,6 +71,56 @@ def test_a_password_is_set_after_a_link_and_signs_in(browser: Browser, environme
         page.get_by_test_id("sign-in-password").fill(PASSWORD)
         page.get_by_test_id("sign-in").click()
         signed_in(page, "ann")
+
+
+def test_a_second_factor_is_added_and_required(browser: Browser, environment: dict[str, str]) -> None:
+    url = environment["TELESCOPE_PUBLIC_URL"]
+    with person(browser, f"{url}/#sign-in={sign_in_link(environment, 'fay')}") as page:
+        signed_in(page, "fay")
+        page.get_by_test_id("signed-in").click()
+        page.get_by_test_id("add-factor").click()
+        page.get_by_test_id("factor-continue").click()  # no password is needed shortly after a link
+        secret = page.get_by_test_id("factor-secret").inner_text().replace(" ", "")
+        assert_good_page(page, "second-factor", part="second-factor")
+        page.get_by_test_id("new-factor-code").fill("000000")
+        page.get_by_test_id("new-factor-code-submit").click()
+        expect(page.get_by_text("The code is wrong")).to_be_visible()
+        page.get_by_test_id("new-factor-code").fill(pyotp.TOTP(secret).now())
+        page.get_by_test_id("new-factor-code-submit").click()
+        recovery = page.get_by_test_id("recovery-codes").locator("code").all_inner_texts()
+        assert_good_page(page, "recovery-codes", part="second-factor")
+        page.get_by_test_id("codes-saved").click()
+        expect(page.get_by_test_id("second-factor")).to_contain_text("10 unused recovery codes")
+    with person(browser, f"{url}/#sign-in={sign_in_link(environment, 'fay')}") as page:
+        expect(page.get_by_test_id("sign-in-code")).to_be_visible()
+        assert_good_page(page, "sign-in-code")
+        page.get_by_test_id("sign-in-code").fill(recovery[0])
+        page.get_by_test_id("sign-in-code-submit").click()
+        signed_in(page, "fay")
+
+
+def test_a_sign_in_of_an_unknown_browser_is_reported_and_can_be_ended(
+    browser: Browser, environment: dict[str, str]
+) -> None:
+    url = environment["TELESCOPE_PUBLIC_URL"]
+    with person(browser, f"{url}/#sign-in={sign_in_link(environment, 'gus')}") as page:
+        signed_in(page, "gus")
+        with person(browser, f"{url}/#sign-in={sign_in_link(environment, 'gus')}") as other:
+            signed_in(other, "gus")
+            page.reload()
+            expect(page.get_by_test_id("sign-in-notice")).to_contain_text("from 127.0.0.1, with Chrome")
+            page.get_by_test_id("sign-in-notice").get_by_role("link").click()
+            assert_good_page(page, "new-sign-in")
+            page.get_by_test_id("sessions").get_by_role("button", name="End the session").click()
+            expect(page.get_by_test_id("sessions").locator("li")).to_have_count(1)
+            other.reload()
+            expect(other.get_by_test_id("sign-in-name")).to_be_visible()
+        page.get_by_test_id("sign-in-confirm").click()
+        expect(page.get_by_test_id("sign-in-notice")).to_have_count(0)
+        page.reload()
+        signed_in(page, "gus")
+        expect(page.get_by_test_id("sessions").locator("li")).to_have_count(1)
+        expect(page.get_by_test_id("sign-in-notice")).to_have_count(0)
 
 
 def test_sign_in_at_a_provider_returns_with_a_lasting_session(browser: Browser, environment: dict[str, str]) -> None:

@@ -13,6 +13,8 @@ import { lazyPage } from "./lazy-page";
 import { Navigation } from "./navigation-bar";
 import { type PageProps, ROWS } from "./page-registry";
 import { type RouteParameters, route } from "../shared/routing/routes";
+import { SecondFactorPage } from "../features/account/second-factor-page";
+import { SignInNotice } from "../features/account/sign-in-notice";
 import { SignInPage } from "../features/account/sign-in-page";
 
 const LAZY_PAGES = new Map([...ROWS].map(([name, { load }]) => [name, lazyPage(load)]));
@@ -45,6 +47,8 @@ export function App({ api, session, followed, pairing }: AppProps) {
       );
     case "out":
       return <SignInPage api={api} session={session} followed={followed} pairing={pairing.code.value !== null} error={state.reason} />;
+    case "code":
+      return <SecondFactorPage session={session} />;
     case "in":
       return (
         <SignedIn
@@ -85,6 +89,7 @@ function SignedIn({ api, session, followed, pairing, account }: SignedInProps) {
       </a>
       <Navigation account={account} session={session} />
       <LinkBanner fleet={fleet} />
+      <SignInNotice api={api} account={account} />
       <CurrentPage api={api} fleet={fleet} account={account} followed={followed} pairing={pairing} />
     </>
   );

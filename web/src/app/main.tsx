@@ -1,9 +1,11 @@
 import { effect } from "@preact/signals";
 import { render } from "preact";
 import { Api } from "../shared/api/client";
+import { storage } from "../shared/hooks/browser-storage";
 import { startClock } from "../shared/lib/clock";
 import { FollowedInvitation, invitationSecret } from "../features/sharing/model/invitation-link";
 import { FollowedCode, pairingCode } from "../features/pairing/model/claim-code";
+import { KnownBrowser } from "../features/account/model/known-browser";
 import { Session, signInFailure, signInToken } from "../features/account/model/session";
 import "../shared/ui/styles/tokens.css";
 import "../shared/ui/styles/base.css";
@@ -18,7 +20,7 @@ import { App, preloadPages } from "./app";
 import { invitationAddress, pairAddress, replaceWith } from "../shared/routing/routes";
 
 const api = new Api();
-const session = new Session(api);
+const session = new Session(api, new KnownBrowser(storage()));
 const followed = new FollowedInvitation(sessionStorage);
 const pairing = new FollowedCode(sessionStorage);
 

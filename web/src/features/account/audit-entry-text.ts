@@ -3,6 +3,7 @@ import { subjectOf } from "./model/audit-log";
 import type { AuditRecord, Role } from "../../shared/api/sharing";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
+import { browserName } from "./model/sign-in-notice";
 import { texts } from "./texts";
 
 /** Names by record id. Ids without a name are shown unchanged. */
@@ -25,7 +26,12 @@ export function entryText(record: AuditRecord, names: Names): string {
   const target = targetName(record.target, names);
   switch (event) {
     case "signed-in":
-      return sentences.signedIn(caller, sentences.method[text(data, "how")] ?? "");
+      return sentences.signedIn(
+        caller,
+        sentences.method[text(data, "how")] ?? "",
+        browserName(text(data, "program")),
+        text(data, "address"),
+      );
     case "sign-in-rejected":
       return sentences.signInRejected;
     case "signed-out":
@@ -34,6 +40,12 @@ export function entryText(record: AuditRecord, names: Names): string {
       return sentences.accountCreated(caller);
     case "password-set":
       return sentences.passwordSet(caller);
+    case "second-factor-enabled":
+      return sentences.factorEnabled(caller);
+    case "second-factor-disabled":
+      return sentences.factorDisabled(caller);
+    case "recovery-codes-made":
+      return sentences.recoveryCodesMade(caller);
     case "api-key-made":
       return sentences.keyCreated(caller, text(data, "name"), role(data), scopeText(data["only"], names));
     case "api-key-revoked":

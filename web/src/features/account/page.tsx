@@ -1,12 +1,13 @@
-import type { SignInSession } from "../../shared/api/types";
 import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
-import { useEffect, useState } from "preact/hooks";
+import { useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import { common } from "../../shared/i18n/common";
 import { texts } from "./texts";
 import { ApiKeys } from "./api-keys";
+import { SecondFactorCard } from "./second-factor";
+import { Sessions } from "./sessions";
 import { auditLogAddress, deviceListAddress } from "../../shared/routing/routes";
 
 /** The user's account: password, storage, other sessions, API keys and audit log. */
@@ -22,6 +23,7 @@ export function AccountPage({ api, fleet }: { api: Api; fleet: Fleet }) {
       <ApiKeys api={api} fleet={fleet} />
       <PasswordForm api={api} onDone={() => setChanges((count) => count + 1)} />
       <Storage api={api} />
+      <SecondFactorCard api={api} onEnabled={() => setChanges((count) => count + 1)} />
       <Sessions key={changes} api={api} />
     </main>
   );
@@ -54,7 +56,7 @@ function PasswordForm({ api, onDone }: { api: Api; onDone: () => void }) {
     setMessage("");
     setBusy(true);
     try {
-      await api.setPassword(newPassword, oldPassword);
+      await api.account.setPassword(newPassword, oldPassword);
       setOldPassword("");
       setNewPassword("");
       setMessage(texts.account.changed);
@@ -106,62 +108,6 @@ function PasswordForm({ api, onDone }: { api: Api; onDone: () => void }) {
           {error === "" ? message : error}
         </p>
       </form>
-    </Card>
-  );
-}
-
-function Sessions({ api }: { api: Api }) {
-  const [sessions, setSessions] = useState<SignInSession[] | null>(null);
-  const [error, setError] = useState("");
-
-  const load = async (): Promise<void> => {
-    try {
-      setSessions(await api.sessions());
-    } catch (error) {
-      setError(sentence(error));
-    }
-  };
-  const end = async (ending: Promise<void>): Promise<void> => {
-    setError("");
-    try {
-      await ending;
-    } catch (error) {
-      setError(sentence(error));
-    }
-    await load();
-  };
-  useEffect(() => void load(), [api]);
-
-  return (
-    <Card title={texts.account.sessions}>
-      {sessions === null && error === "" && <p class="quiet">{common.loading}</p>}
-      <ul class="devices">
-        {sessions?.map((session) => (
-          <li key={session.id}>
-            {texts.account.session(texts.account.method[session.method], new Date(session.created_at).toLocaleString("en"))}{" "}
-            <span class="quiet">
-              {session.address} {session.program}
-            </span>{" "}
-            {session.mine ? (
-              <strong>{texts.account.this}</strong>
-            ) : (
-              <button type="button" class="plain" onClick={() => void end(api.endSession(session.id))}>
-                {texts.account.end}
-              </button>
-            )}
-          </li>
-        ))}
-      </ul>
-      {sessions !== null && sessions.length > 1 && (
-        <p>
-          <button type="button" onClick={() => void end(api.endOtherSessions())}>
-            {texts.account.endOthers}
-          </button>
-        </p>
-      )}
-      <p class="field-error" aria-live="polite">
-        {error}
-      </p>
     </Card>
   );
 }

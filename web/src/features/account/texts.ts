@@ -41,11 +41,46 @@ export const texts = {
     used: (usedBytes: number, limitBytes: number): string =>
       `${format.oneDigit(usedBytes / 1e6)} MB of ${Math.round(limitBytes / 1e6)} MB are in use by captures, movements and robot types.`,
     sessions: "Active sessions",
-    session: (how: string, since: string): string => `By ${how}, since ${since}`,
+    session: (how: string, since: string, used: string): string =>
+      `Signed in by ${how} on ${format.dateTime(since)}, last used ${format.dateTime(used)}`,
     method: { link: "link", password: "password", "oidc": "your identity provider" },
     this: "this session",
     end: "End",
+    endOf: (browser: string, address: string): string => `End the session of ${browser} at ${address}`,
     endOthers: "End all other sessions",
+  },
+
+  factor: {
+    title: "Second factor",
+    explained: "An authenticator app on your phone gives a code at each sign-in. A stolen password alone then does not open your account.",
+    add: "Add authenticator app",
+    passwordExplained: "Confirm with your password. Within ten minutes of opening a sign-in link, the password can stay empty.",
+    password: "Current password",
+    continue: "Continue",
+    cancel: "Cancel",
+    scan: "Scan this code with your authenticator app.",
+    qr: "QR code with the secret for an authenticator app",
+    byHand: "Or enter this secret in the app:",
+    confirmCode: "Code of the app",
+    enable: "Turn on",
+    on: (since: string): string => `On since ${format.dateTime(since)}.`,
+    left: (count: number): string => `${format.count(count, "unused recovery code")}.`,
+    renew: "New recovery codes",
+    disable: "Turn off",
+    code: "Code of the app, or a recovery code",
+    codesReady: "These are your recovery codes.",
+    codesExplained: "Each works once in place of the app. Store them in a safe place now: they are shown only once.",
+    saved: "I have stored them",
+    required: "Enter your code",
+    requiredExplained: "Open your authenticator app and enter the code for Telescope.",
+    lost: "If you have lost the app and your recovery codes, ask the operator of this server to remove the second factor.",
+  },
+
+  signIns: {
+    title: (count: number): string => (count === 1 ? "New sign-in to your account." : `${count} new sign-ins to your account.`),
+    origin: (at: string, address: string, browser: string): string => `${format.dateTime(at)}, from ${address}, with ${browser}.`,
+    review: "Not you? End sessions and change your password",
+    confirm: "It was me",
   },
 
   keys: {
@@ -128,6 +163,9 @@ export const texts = {
       "signed-out": "Signed out",
       "account-made": "Account created",
       "password-set": "Password set",
+      "second-factor-enabled": "Second factor turned on",
+      "second-factor-disabled": "Second factor turned off",
+      "recovery-codes-made": "Recovery codes created",
       "api-key-made": "API key created",
       "api-key-revoked": "API key revoked",
       "space-made": "Space created",
@@ -163,13 +201,17 @@ export const texts = {
     } as Readonly<Record<string, string>>,
     /** Sentences for the event kinds whose records contain no text. */
     sentences: {
-      signedIn: (caller: string, how: string): string => `${caller} signed in ${how}.`,
+      signedIn: (caller: string, how: string, browser: string, address: string): string =>
+        browser === "" ? `${caller} signed in ${how}.` : `${caller} signed in ${how}, from ${address}, with ${browser}.`,
       method: { link: "with a link", password: "with a password", "oidc": "with the identity provider" } as Readonly<Record<string, string>>,
       signInRejected: "A sign-in was rejected.",
       signedOut: (caller: string): string => `${caller} signed out.`,
       allSessionsEnded: (caller: string): string => `All sessions of ${caller} ended.`,
       accountCreated: (caller: string): string => `The account ${caller} was created.`,
       passwordSet: (caller: string): string => `${caller} set a new password.`,
+      factorEnabled: (caller: string): string => `${caller} turned the second factor on.`,
+      factorDisabled: (caller: string): string => `${caller} turned the second factor off.`,
+      recoveryCodesMade: (caller: string): string => `${caller} created new recovery codes.`,
       keyCreated: (caller: string, name: string, role: string, scope: string): string =>
         `${caller} created the API key “${name}”: ${role.toLowerCase()}, ${scope}.`,
       keyRevoked: (caller: string, name: string): string => `${caller} revoked ${name === "" ? "an API key" : `the API key “${name}”`}.`,

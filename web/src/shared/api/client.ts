@@ -1,5 +1,6 @@
 /** The HTTP API calls of the console. The session uses an HttpOnly cookie. */
-import type { Account, Action, ActionCallOptions, ControlRequestInfo, Credentials, Device, GrantedLease, LatencyBatch, Lease, Purpose, Series, SignInMethods, SignInSession, Space, StorageUsage, Upload, Watcher } from "./types";
+import type { Account, Action, ActionCallOptions, ControlRequestInfo, Credentials, Device, GrantedLease, LatencyBatch, Lease, Purpose, Series, SignInMethods, Space, StorageUsage, Upload, Watcher } from "./types";
+import { AccountApi } from "./account";
 import { HealthApi } from "./health";
 import { LatencyApi } from "./latency";
 import { Http, type Page } from "./http";
@@ -18,11 +19,22 @@ interface SignedIn {
   account: { id: string; name: string };
   session: string;
   csrf_token: string;
+  device_token: string;
+}
+
+/** What a sign-in sends in addition; empty: not sent. */
+export interface SignInExtras {
+  /** Of the authenticator app, or a recovery code. */
+  code: string;
+  /** Of an earlier sign-in of this browser. */
+  deviceToken: string;
 }
 
 /** One method per call. All methods throw only `ApiError`. */
 export class Api {
   readonly #http: Http;
+  /** The signed-in account. */
+  readonly account: AccountApi;
   /** Device health. */
   readonly health: HealthApi;
   readonly library: Library;
@@ -33,6 +45,7 @@ export class Api {
 
   constructor(base = "/api/v1") {
     this.#http = new Http(base);
+    this.account = new AccountApi(this.#http);
     this.health = new HealthApi(this.#http);
     this.library = new Library(this.#http);
     this.robotTypes = new RobotTypes(this.#http);
@@ -40,16 +53,18 @@ export class Api {
     this.transfers = new Transfers(this.#http);
   }
 
-  async signIn(link: string): Promise<Account> {
-    return this.#signedIn(await this.#http.call("POST", "/auth/sign-in", { body: { link } }));
+  /** Returns the token that marks this browser as known. */
+  async signIn(link: string, extras: SignInExtras): Promise<string> {
+    return this.#signedIn(await this.#http.call("POST", "/auth/sign-in", { body: { link, ...sent(extras) } }));
   }
 
-  async signInByPassword(name: string, password: string): Promise<Account> {
-    return this.#signedIn(await this.#http.call("POST", "/auth/password", { body: { name, password } }));
+  /** Like `signIn`. */
+  async signInByPassword(name: string, password: string, extras: SignInExtras): Promise<string> {
+    return this.#signedIn(await this.#http.call("POST", "/auth/password", { body: { name, password, ...sent(extras) } }));
   }
 
-  /** Creates an account with an invitation's secret, signs in and redeems the invitation. */
-  async createAccount(invitation: string, name: string, password: string): Promise<Account> {
+  /** Creates an account with an invitation's secret, signs in and redeems the invitation. Returns like `signIn`. */
+  async createAccount(invitation: string, name: string, password: string): Promise<string> {
     return this.#signedIn(await this.#http.call("POST", "/auth/accounts", { body: { invitation, name, password } }));
   }
 
@@ -60,23 +75,6 @@ export class Api {
 
   signInMethods(): Promise<SignInMethods> {
     return this.#http.call("GET", "/auth/methods");
-  }
-
-  async setPassword(password: string, old: string): Promise<void> {
-    const body = old === "" ? { password } : { password, old_password: old };
-    await this.#http.call("PUT", "/accounts/me/password", { body });
-  }
-
-  sessions(): Promise<SignInSession[]> {
-    return this.#http.all("/accounts/me/sessions");
-  }
-
-  async endSession(id: string): Promise<void> {
-    await this.#http.call("DELETE", `/accounts/me/sessions/${id}`);
-  }
-
-  async endOtherSessions(): Promise<void> {
-    await this.#http.call("DELETE", "/accounts/me/sessions");
   }
 
   async signOut(): Promise<void> {
@@ -286,10 +284,14 @@ export class Api {
     return this.#http.call("POST", "/mqtt/credentials", { body: purpose });
   }
 
-  #signedIn(response: SignedIn): Account {
+  #signedIn(response: SignedIn): string {
     this.#http.setCsrfToken(response.csrf_token);
-    return { ...response.account, session: response.session };
+    return response.device_token;
   }
+}
+
+function sent({ code, deviceToken }: SignInExtras): Record<string, string> {
+  return { ...(code === "" ? {} : { code }), ...(deviceToken === "" ? {} : { device_token: deviceToken }) };
 }
 
 function requests(device: string): string {

@@ -24,7 +24,11 @@ export interface SignInSession {
   id: string;
   method: "link" | "password" | "oidc";
   created_at: string;
+  /** Accurate to five minutes. */
+  last_used_at: string;
+  /** Of the last use. */
   address: string;
+  /** User agent of the last use. */
   program: string;
   mine: boolean;
 }

@@ -1,6 +1,8 @@
 import { beforeEach, describe, expect, it } from "vitest";
+import { KnownBrowser } from "../../../src/features/account/model/known-browser";
 import { Session, signInFailure, signInToken } from "../../../src/features/account/model/session";
 import { server } from "../../support/console";
+import { FakeStorage } from "../../support/fake-storage";
 import { none, ok, problem, unreachable } from "../../support/fake-server";
 import { DEVICE } from "../../support/messages";
 
@@ -8,14 +10,16 @@ const STOP = `/devices/${DEVICE}/stop`;
 const CSRF = "of-this-session";
 
 let session: Session;
+let browser: FakeStorage;
 
 beforeEach(() => {
-  const signedIn = ok({ account: { id: "demo", name: "Demo" }, session: "s1", csrf_token: CSRF });
+  const signedIn = ok({ account: { id: "demo", name: "Demo" }, session: "s1", csrf_token: CSRF, device_token: "known" });
   server.on("POST /auth/sign-in", ({ body }) => (body["link"] === "good" ? signedIn : problem(401, "link-used", "This link was used before.")));
   server.on("POST /auth/password", ({ body }) => (body["password"] === "right" ? signedIn : problem(401, "unauthorized", "Wrong password.")));
   server.on("POST /auth/sign-out", none);
   server.on("GET /accounts/me", ok({ id: "demo", name: "Demo", session: "s1", csrf_token: CSRF }));
-  session = new Session(server.api);
+  browser = new FakeStorage();
+  session = new Session(server.api, new KnownBrowser(browser));
 });
 
 describe("a session", () => {
@@ -33,11 +37,41 @@ describe("a session", () => {
     expect(session.state.value).toMatchObject({ kind: "in", account: { name: "Demo" } });
   });
 
+  it("asks for the code of a second factor and repeats the sign-in with it", async () => {
+    const signedIn = ok({ account: { id: "demo", name: "Demo" }, session: "s1", csrf_token: CSRF, device_token: "known" });
+    const guarded = ({ body }: { body: Record<string, unknown> }) => {
+      if (body["code"] === "123456") return signedIn;
+      return body["code"] === undefined ? problem(403, "second-factor-required", "Enter it.") : problem(403, "second-factor-wrong", "Wrong.");
+    };
+    server.on("POST /auth/password", guarded);
+    server.on("POST /auth/sign-in", guarded);
+    for (const begin of [() => session.signInWithPassword("demo", "right"), () => session.start("good")]) {
+      await begin();
+      expect(session.state.value).toEqual({ kind: "code" });
+      await expect(session.submitCode("000000")).rejects.toMatchObject({ code: "second-factor-wrong" });
+      expect(session.state.value).toEqual({ kind: "code" });
+      await session.submitCode("123456");
+      expect(session.state.value.kind).toBe("in");
+    }
+    await session.start("good");
+    session.cancelCode();
+    expect(session.state.value).toEqual({ kind: "out", reason: "" });
+  });
+
+  it("identifies this browser at the next sign-in to the same account", async () => {
+    await session.signInWithPassword("Demo", "right");
+    await session.signInWithPassword("demo ", "right");
+    await session.signInWithPassword("other", "right");
+    await session.start("good");
+    expect(server.callsTo("POST /auth/password").map(({ body }) => body["device_token"])).toEqual([undefined, "known", undefined]);
+    expect(server.callsTo("POST /auth/sign-in")[0]?.body).toMatchObject({ device_token: "known" });
+  });
+
   it("starts with a new account of an invitation, or reports why there is none", async () => {
     server.on("POST /auth/accounts", problem(409, "name-taken", "This name is taken."));
     await expect(session.createAccount("secret", "Bob", "correct horse battery")).rejects.toMatchObject({ code: "name-taken" });
     expect(session.state.value.kind).not.toBe("in");
-    server.on("POST /auth/accounts", ok({ account: { id: "bob", name: "Bob" }, session: "s1", csrf_token: CSRF }));
+    server.on("POST /auth/accounts", ok({ account: { id: "bob", name: "Bob" }, session: "s1", csrf_token: CSRF, device_token: "known" }));
     await session.createAccount("secret", "Bob", "correct horse battery");
     expect(session.state.value.kind).toBe("in");
     expect(server.callsTo("POST /auth/accounts")[1]?.body).toEqual({ invitation: "secret", name: "Bob", password: "correct horse battery" });

@@ -1,22 +1,29 @@
 /** The signed-in account. The token of a sign-in link is used once and never stored. */
 import type { Account } from "../../../shared/api/types";
 import { signal, type ReadonlySignal } from "@preact/signals-core";
-import type { Api } from "../../../shared/api/client";
+import type { Api, SignInExtras } from "../../../shared/api/client";
 import { ApiError, sentence } from "../../../shared/api/http";
+import type { KnownBrowser } from "./known-browser";
 
 type SessionState =
   | { kind: "checking" }
   /** `why`: the error of a sign-in link or the reason for the session's end; empty on a first visit. */
   | { kind: "out"; reason: string }
+  /** The account requires the code of its second factor. */
+  | { kind: "code" }
   | { kind: "in"; account: Account };
 
 export class Session {
   readonly #api: Api;
+  readonly #browser: KnownBrowser;
+  /** Repeats the sign-in that requires a code. */
+  #repeat: ((code: string) => Promise<void>) | null = null;
   readonly #state = signal<SessionState>({ kind: "checking" });
   readonly state: ReadonlySignal<SessionState> = this.#state;
 
-  constructor(api: Api) {
+  constructor(api: Api, browser: KnownBrowser) {
     this.#api = api;
+    this.#browser = browser;
   }
 
   /**
@@ -27,7 +34,7 @@ export class Session {
   async start(link: string | null, failed = ""): Promise<void> {
     this.#state.value = { kind: "checking" };
     try {
-      if (link !== null) await this.#api.signIn(link);
+      if (link !== null && !(await this.#signIn((extras) => this.#api.signIn(link, extras)))) return;
       // From here on the cookie identifies the session: this call proves that the browser stored it.
       this.#state.value = { kind: "in", account: await this.#api.me() };
     } catch (error) {
@@ -36,16 +43,44 @@ export class Session {
     }
   }
 
-  /** Signs in with name and password. Throws the server's error. */
+  /** Signs in with name and password; afterwards a code may be required. Throws the server's error. */
   async signInWithPassword(name: string, password: string): Promise<void> {
-    await this.#api.signInByPassword(name, password);
+    if (!(await this.#signIn((extras) => this.#api.signInByPassword(name, password, extras), name))) return;
     this.#state.value = { kind: "in", account: await this.#api.me() };
+  }
+
+  /** Completes a sign-in with the code of the second factor. Throws the server's error. */
+  async submitCode(code: string): Promise<void> {
+    await this.#repeat?.(code);
+    this.#repeat = null;
+    this.#state.value = { kind: "in", account: await this.#api.me() };
+  }
+
+  cancelCode(): void {
+    this.#repeat = null;
+    this.#state.value = { kind: "out", reason: "" };
   }
 
   /** Creates an account with an invitation and signs in to it. Throws the server's error. */
   async createAccount(invitation: string, name: string, password: string): Promise<void> {
-    await this.#api.createAccount(invitation, name, password);
+    this.#browser.remember(await this.#api.createAccount(invitation, name, password), name);
     this.#state.value = { kind: "in", account: await this.#api.me() };
+  }
+
+  /** Whether the sign-in is complete; otherwise it requires a code. */
+  async #signIn(call: (extras: SignInExtras) => Promise<string>, name?: string): Promise<boolean> {
+    const attempt = async (code: string): Promise<void> => {
+      this.#browser.remember(await call({ code, deviceToken: this.#browser.token(name) }), name);
+    };
+    try {
+      await attempt("");
+      return true;
+    } catch (error) {
+      if (!(error instanceof ApiError) || error.code !== "second-factor-required") throw error;
+      this.#repeat = attempt;
+      this.#state.value = { kind: "code" };
+      return false;
+    }
   }
 
   async signOut(): Promise<void> {
