@@ -35,19 +35,19 @@ def add_commands(commands: Any) -> None:
 
 
 async def _sign_in_link(functions: Functions, options: argparse.Namespace) -> None:
-    account = await functions.sign_in.account(options.account)
-    if options.remove_second_factor:
-        try:
+    try:
+        account = await functions.sign_in.account(options.account)
+        if options.remove_second_factor:
             await functions.second_factor.remove(account)
-        except Problem as problem:
-            raise SettingsError(problem.detail) from problem
+    except Problem as problem:
+        raise SettingsError(problem.detail) from problem
     print(f"{functions.settings.public_url}/#sign-in={await functions.sign_in.link(account)}")
 
 
 async def _api_key(functions: Functions, options: argparse.Namespace) -> None:
-    account = await functions.sign_in.account(options.account)
     request = ApiKeyRequest(label=options.name, most=Role(options.role), only=tuple(options.only), days=options.days)
     try:
+        account = await functions.sign_in.account(options.account)
         _, token = await functions.api_keys.make(Identity(account.id, account.name, "terminal"), request)
     except Problem as problem:
         raise SettingsError(problem.detail) from problem

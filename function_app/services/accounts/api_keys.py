@@ -8,6 +8,7 @@ from typing import Final
 from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.ids import split_device
 from function_app.domain.common.problems import Problem, invalid, not_found, unauthorized
+from function_app.domain.common.text import label_error
 from function_app.domain.identity import api_keys as rules
 from function_app.domain.identity.accounts import Identity, Role
 from function_app.domain.identity.api_keys import ApiKey
@@ -86,6 +87,9 @@ class ApiKeys:
         """
         if request.most is Role.OWNER:
             raise invalid("An API key has the role operator or viewer. Only a signed-in person can be owner.")
+        error = label_error(request.label)
+        if error:
+            raise invalid(f"The name of the key {error}.")
         if not 1 <= request.days <= rules.MOST_DAYS:
             raise invalid(f"An API key is valid for 1 to {rules.MOST_DAYS} days. Create another one after that.")
         if len(await self._ids(caller.account)) >= MAX_KEYS:

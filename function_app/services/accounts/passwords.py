@@ -15,6 +15,7 @@ from function_app.ports.password_hasher import PasswordHasher
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.accounts.sign_out import SignOut
 from function_app.services.audit.audit_log import AuditLog
+from function_app.services.identity.account_names import reserve_new_name
 from function_app.services.identity.guess_limiter import Guess, GuessLimiter, by_address
 from function_app.services.identity.sessions import Sessions, SignedIn, SignInOrigin
 from function_app.services.identity.sign_in import SignIn, named_partition, new_name
@@ -89,6 +90,7 @@ class Passwords:
             await self._refused(account, origin, WRONG)
             raise unauthorized("Name or password is wrong.")
         await self._guess_limiter.remove_failure(GUESS, counters)
+        await self._sign_in.protect_name(account_of_name)
         used = await self._sign_in.check_second_factor(account, code, origin)
         signed_in = await self._sessions.begin(account_of_name, "password", origin, second_factor=used)
         current = await self._tables.get(records.ACCOUNTS, account, _PASSWORD)
@@ -139,12 +141,13 @@ class Passwords:
     async def register(self, name: str, password: str) -> Account:
         """Create a local account. The password is written before the name, so that no name exists without a password.
 
-        Raises ``name-taken`` or ``password-weak``.
+        Raises ``name-invalid``, ``name-taken`` or ``password-weak``.
         """
         taken = Problem("name-taken", 409, "The name is taken", "Another account has this name. Choose another name.")
         if await self._sign_in.known(name) is not None:
             raise taken
         stored = await self._store(password, name)
+        await reserve_new_name(self._tables, name)
         account = new_id(12)
         row = await self._tables.create(records.ACCOUNTS, Row(account, _PASSWORD, records.to_data(stored)))
         try:

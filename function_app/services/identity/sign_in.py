@@ -1,14 +1,17 @@
 """Sign-in by one-time link, and account creation."""
 
+import contextlib
 import hashlib
 
 from function_app.domain.audit.hash_chain import CLOUD, AccountEvent
 from function_app.domain.common.ids import new_id
 from function_app.domain.common.problems import Problem, unauthorized
+from function_app.domain.common.text import clean_label
 from function_app.domain.identity.accounts import Account, Identity, Space, fold_name
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.audit.audit_log import AuditLog
+from function_app.services.identity.account_names import reserve_name, reserve_new_name
 from function_app.services.identity.authenticator import new_secret
 from function_app.services.identity.second_factor import SecondFactor, Used, sign_in_counter
 from function_app.services.identity.sessions import Sessions, SignedIn, SignInOrigin
@@ -34,7 +37,10 @@ class SignIn:
         self._clock = clock
 
     async def account(self, name: str) -> Account:
-        """The local account with this name, created with its first space if missing. The first spelling is kept."""
+        """The local account with this name, created with its first space if missing. The first spelling is kept.
+
+        Raises ``name-invalid``, or ``name-taken``: the name of a new account looks like an existing one.
+        """
         row = await self._named(name)
         return await self._account(row.partition if row else named_partition(name), name, keep=True)
 
@@ -59,12 +65,14 @@ class SignIn:
         """Create or complete an account; ``keep`` its display name. The next call completes an interrupted creation."""
         row = await self._tables.get(records.ACCOUNTS, partition, "account")
         if row is None:
+            if keep:
+                await reserve_new_name(self._tables, name)
             ids = new_name(new_id(12), name)
             try:
                 row = await self._tables.create(records.ACCOUNTS, Row(partition, "account", ids))
             except Conflict:
                 return await self._account(partition, name, keep=keep)
-        account = _of(row, name) if keep else Account(id=str(row.data["account"]), name=name)
+        account = _of(row, name) if keep else Account(id=str(row.data["account"]), name=clean_label(name))
         spaces = await self.spaces(account.id)
         if not spaces:
             space = Space(id=str(row.data["space"]), name=FIRST_SPACE)
@@ -97,6 +105,11 @@ class SignIn:
         """The local account with this name in any spelling, with its original name."""
         row = await self._named(name)
         return _of(row, name) if row else None
+
+    async def protect_name(self, account: Account) -> None:
+        """Reserve the names that look like the one of an account that was created before such names were rejected."""
+        with contextlib.suppress(Problem):
+            await reserve_name(self._tables, account.name)
 
     async def named(self, account: str) -> str:
         """The name of an account; empty if it does not exist."""

@@ -1,11 +1,11 @@
 """Requests and responses of accounts, sign-in, spaces, API keys and the audit log."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
 
 from function_app.domain.identity.api_keys import MOST_DAYS, MOST_ONLY
-from function_app.entrypoints.http.framework.schemas import AccountRef, Moment, Name, Request, Response
+from function_app.entrypoints.http.framework.schemas import AccountRef, LabelledRequest, Moment, Name, Request, Response
 
 DeviceToken = Annotated[
     str, Meta(max_length=2000, description="From an earlier sign-in of this browser or program; optional.")
@@ -204,9 +204,10 @@ class SessionsEnded(Response, frozen=True, kw_only=True):
     ended: int
 
 
-class SpaceRequest(Request, frozen=True, kw_only=True):
+class SpaceRequest(LabelledRequest, frozen=True, kw_only=True):
     """A new space."""
 
+    labels: ClassVar = ("name",)
     name: Name
 
 

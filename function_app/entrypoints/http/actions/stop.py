@@ -3,6 +3,7 @@
 from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
+from function_app.domain.common.text import clean_label
 from function_app.entrypoints.http.actions import schemas
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
 from function_app.entrypoints.http.framework.responses import json_response, problem_item, read_or
@@ -20,9 +21,8 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     async def stop_device(request: Request, device: str) -> Response:
         """Requires no lease. The Stop stays latched until it is reset."""
         caller = await auth.account(request)
-        payload = await read_or(request, schemas.StopRequest, schemas.StopRequest())
         return json_response(
-            schemas.StopConfirmation(confirmed=await functions.stop.stop(caller, device, payload.reason))
+            schemas.StopConfirmation(confirmed=await functions.stop.stop(caller, device, await _reason(request)))
         )
 
     @routes.add("POST /devices/{device}/stop/reset", "Reset a Stop", schemas.StopConfirmation, 404)
@@ -44,8 +44,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     async def stop_space(request: Request, space: str) -> Response:
         """Stops all devices that the caller may operate. 207: some have not confirmed; each item has its status."""
         caller = await auth.account(request)
-        payload = await read_or(request, schemas.StopRequest, schemas.StopRequest())
-        return _all(await functions.stop.stop_many(caller, payload.reason, space=space))
+        return _all(await functions.stop.stop_many(caller, await _reason(request), space=space))
 
     @routes.add(
         "POST /stop",
@@ -56,10 +55,15 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     async def stop_all(request: Request) -> Response:
         """Stops all devices that the caller may operate. 207: some have not confirmed; each item has its status."""
         caller = await auth.account(request)
-        payload = await read_or(request, schemas.StopRequest, schemas.StopRequest())
-        return _all(await functions.stop.stop_many(caller, payload.reason))
+        return _all(await functions.stop.stop_many(caller, await _reason(request)))
 
     return routes
+
+
+async def _reason(request: Request) -> str:
+    """The reason with spaces for characters that a label must not contain: they must not prevent a Stop."""
+    payload = await read_or(request, schemas.StopRequest, schemas.StopRequest())
+    return clean_label(payload.reason)
 
 
 def _all(results: list[StopResult]) -> Response:

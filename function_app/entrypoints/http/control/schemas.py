@@ -1,6 +1,6 @@
 """Requests and responses of leases, control requests and MQTT credentials."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta
 
@@ -8,6 +8,7 @@ from device_agent.protocol import Id
 from function_app.entrypoints.http.framework.schemas import (
     AgentRequest,
     Epoch,
+    LabelledRequest,
     LeaseMs,
     Moment,
     Request,
@@ -27,6 +28,7 @@ class ControlRequestOut(Response, frozen=True, kw_only=True):
 
     id: str
     requester: str
+    requester_account: str
     epoch: int
     mine: bool
     requested_at: Moment
@@ -35,9 +37,13 @@ class ControlRequestOut(Response, frozen=True, kw_only=True):
 
 
 class LeaseOut(Response, frozen=True, kw_only=True):
-    """The lease of a device. ``reason``: why control was taken over. ``request``: the open control request."""
+    """The lease of a device. ``reason``: why control was taken over. ``request``: the open control request.
+
+    ``holder_account``: id of the account. Names can resemble each other; ids cannot.
+    """
 
     holder: str
+    holder_account: str
     epoch: int
     expires_at: Moment
     mine: bool
@@ -45,12 +51,13 @@ class LeaseOut(Response, frozen=True, kw_only=True):
     request: ControlRequestOut | None
 
 
-class LeaseRequest(Request, frozen=True, kw_only=True):
+class LeaseRequest(LabelledRequest, frozen=True, kw_only=True):
     """Without ``epoch``: acquire a new lease. With ``epoch``: renew that lease.
 
     ``take_over``: take control from the current holder. Owners only; requires a ``reason``.
     """
 
+    labels: ClassVar = ("reason",)
     lease_ms: LeaseMs = 30_000
     epoch: Epoch | None = None
     wait_ms: WaitMs = 1_000

@@ -13,6 +13,7 @@ def lease_out(lease: Lease | None, caller: Identity, now_ms: int) -> LeaseOut | 
     request = None if lease.request is None else control_request_out(lease.request, lease, caller, now_ms)
     return LeaseOut(
         holder=lease.holder,
+        holder_account=lease.account,
         epoch=lease.epoch,
         expires_at=rfc3339(lease.expires_ms),
         mine=lease.held_by(caller),
@@ -26,6 +27,7 @@ def control_request_out(request: ControlRequest, lease: Lease, caller: Identity,
     return ControlRequestOut(
         id=request.id,
         requester=request.by,
+        requester_account=request.account,
         epoch=request.epoch,
         mine=request.requested_by(caller),
         requested_at=rfc3339(request.requested_ms),

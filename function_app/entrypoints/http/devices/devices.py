@@ -3,6 +3,8 @@
 from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
+from function_app.domain.common.problems import invalid
+from function_app.domain.common.text import label_error
 from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.devices import schemas
 from function_app.entrypoints.http.devices.serializers import device_out
@@ -49,6 +51,9 @@ def _label_and_viewer_routes(routes: Routes, functions: Functions, auth: Request
         caller = await auth.account(request)
         payload: schemas.RenameDeviceRequest = await read(request, schemas.RenameDeviceRequest)
         label = None if payload.label is None else " ".join(payload.label.split())
+        error = label_error(label or "")
+        if error:
+            raise invalid(f"The label {error}.")
         await functions.rename.rename(caller, device, label)
         return json_response(device_out(await functions.devices.view(caller, device), caller, functions.clock.now_ms()))
 
@@ -62,6 +67,7 @@ def _label_and_viewer_routes(routes: Routes, functions: Functions, auth: Request
         others = tuple(
             schemas.ViewerOut(
                 name=other.name,
+                account=other.account,
                 role=other.role.value,
                 mine=other.account == caller.account,
                 since=rfc3339(other.since_ms),

@@ -54,6 +54,7 @@ class ViewerOut(Response, frozen=True, kw_only=True):
     """A viewer of a device. ``mine``: the caller's account in another session."""
 
     name: str
+    account: str
     role: Literal["owner", "operator", "viewer"]
     mine: bool
     since: Moment

@@ -1,8 +1,10 @@
 """Base classes and common types of the schemas."""
 
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from msgspec import Meta, Struct
+
+from function_app.domain.common.text import require_label
 
 Moment = Annotated[
     str, Meta(description="RFC 3339 time in UTC with milliseconds", examples=["2026-01-31T12:00:00.000Z"])
@@ -20,6 +22,18 @@ class Request(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 class AgentRequest(Request, frozen=True, kw_only=True, forbid_unknown_fields=False):
     """Base class of request bodies of agents. Unknown fields are ignored: the agent may be newer."""
+
+
+class LabelledRequest(Request, frozen=True, kw_only=True):
+    """Base class of request bodies with text for other users, named in ``labels``. See ``domain/common/text.py``."""
+
+    labels: ClassVar[tuple[str, ...]]
+
+    def __post_init__(self) -> None:
+        for field in self.labels:
+            text = getattr(self, field)
+            if text is not None:
+                require_label(text, field)
 
 
 class Response(Struct, frozen=True, kw_only=True):

@@ -1,6 +1,6 @@
 """Requests and responses of agents."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta
 
@@ -10,6 +10,7 @@ from function_app.entrypoints.http.framework.schemas import (
     AccountRef,
     AgentRequest,
     DeviceName,
+    LabelledRequest,
     Moment,
     Name,
     Request,
@@ -17,21 +18,23 @@ from function_app.entrypoints.http.framework.schemas import (
 )
 
 
-class DeviceIn(AgentRequest, frozen=True, kw_only=True):
+class DeviceIn(LabelledRequest, frozen=True, kw_only=True, forbid_unknown_fields=False):
     """One device behind an agent."""
 
+    labels: ClassVar = ("kind", "label")
     name: DeviceName
     kind: Label
     robot_type: Id
     label: Label
 
 
-class EnrollRequest(AgentRequest, frozen=True, kw_only=True):
+class EnrollRequest(LabelledRequest, frozen=True, kw_only=True, forbid_unknown_fields=False):
     """An agent with its devices. ``public_key`` must verify the bearer token.
 
     ``protocol``: versions of the wire contract that it supports. ``capabilities``: kinds of request that it accepts.
     """
 
+    labels: ClassVar = ("name", "software")
     name: Name
     public_key: Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{43}$")]
     software: Label

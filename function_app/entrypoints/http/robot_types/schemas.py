@@ -1,13 +1,13 @@
 """Requests and responses of robot types, previews, movements and the script editor."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta, field
 
 from device_agent.protocol import Body, Joint, Label, Stream
 from device_agent.protocol.description import MimicJoint, PositionDependentLimit
 from device_agent.protocol.documents.script_api import ScriptApi
-from function_app.entrypoints.http.framework.schemas import Moment, Request, Response, WaitMs
+from function_app.entrypoints.http.framework.schemas import LabelledRequest, Moment, Request, Response, WaitMs
 from function_app.services.robot_types.package_reader import MAX_FILES, MAX_MANIFEST
 from function_app.services.robot_types.parameter_schema import ObjectSchema
 from function_app.services.robot_types.script_metadata import MAX_SOURCE
@@ -166,7 +166,7 @@ class MovementList(Response, frozen=True, kw_only=True):
     cursor: str | None
 
 
-class MovementRequest(Request, frozen=True, kw_only=True):
+class MovementRequest(LabelledRequest, frozen=True, kw_only=True):
     """A movement script.
 
     ``description``: default: first line of the script's docstring. ``parameters_schema``: default: its literal
@@ -174,6 +174,7 @@ class MovementRequest(Request, frozen=True, kw_only=True):
     0 for none; 409 ``movement-changed`` if it is not the newest.
     """
 
+    labels: ClassVar = ("description",)
     source: Annotated[str, Meta(min_length=1, max_length=MAX_SOURCE)]
     description: Label | None = None
     parameters_schema: ObjectSchema | None = None

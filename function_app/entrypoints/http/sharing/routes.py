@@ -311,6 +311,7 @@ def _invitation(view: KnownInvitation) -> dict[str, Any]:
         "label": invitation.label,
         "role": invitation.role.value,
         "created_by": invitation.by,
+        "created_by_account": invitation.owner,
         "uses": invitation.uses,
         "share_s": invitation.share_s or None,
         "expires_at": rfc3339(invitation.expires_ms),

@@ -71,6 +71,7 @@ class InvitationOut(Response, frozen=True, kw_only=True):
     """An open invitation. ``role`` ``owner``: a transfer. ``share_s``: duration of the share; null: unlimited.
 
     ``account``: the only account that may redeem it, visible to the owner; null: any account with the secret.
+    ``created_by_account``: id of the account that created it.
     """
 
     id: str
@@ -79,6 +80,7 @@ class InvitationOut(Response, frozen=True, kw_only=True):
     label: str
     role: Literal["owner", "operator", "viewer"]
     created_by: str
+    created_by_account: str
     uses: int
     share_s: int | None
     expires_at: Moment
