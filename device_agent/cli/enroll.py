@@ -90,7 +90,8 @@ def await_claim(store: IdentityStore, api: CloudClient, config: AgentConfig, cla
             store.save_pairing(pairing)
             if again and sys.stdout.isatty():
                 print()  # ends the line of the waiting message
-            print(f"paired with {pairing.account}", flush=True)
+            # An account chooses its name but not its id; the console shows the same short id.
+            print(f"paired with {pairing.account} #{pairing.owner[:6]}", flush=True)
             return pairing
         if time.monotonic() > expires_s:
             print("the claim code has expired; here is a new one", flush=True)

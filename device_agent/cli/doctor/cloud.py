@@ -55,7 +55,7 @@ def examine(store: IdentityStore, configuration: AgentConfig) -> Iterator[Findin
     if enrollment.get("space") != pairing.space:
         yield warning("pairing", "the agent was moved to another space", "No action is needed: `run` detects it.")
         return
-    yield ok("pairing", f"paired with {pairing.account}")
+    yield ok("pairing", f"paired with {pairing.account} #{pairing.owner[:6]}")
     yield _keys(store, enrollment, pairing, clock)
     yield from _link(store, configuration, pairing, clock)
 

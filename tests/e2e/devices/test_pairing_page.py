@@ -108,7 +108,7 @@ def test_a_robot_is_paired_by_the_link_in_the_terminal(browser: Browser, machine
         page.get_by_test_id("claim").press("Enter")
         expect(page.get_by_test_id("paired")).to_be_visible()
         assert terminal.process.wait(30) == 0
-        assert "paired with demo" in terminal.text
+        assert "paired with demo #" in terminal.text
         row = page.get_by_test_id("paired-device")
         expect(row).to_contain_text("Guest room")
         expect(row).to_contain_text("Waiting for the first data")

@@ -1,3 +1,5 @@
+import type { Account } from "../../shared/api/types";
+import { accountLabel } from "../../shared/lib/account-label";
 import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
 import { useState } from "preact/hooks";
@@ -11,12 +13,13 @@ import { Sessions } from "./sessions";
 import { auditLogAddress, deviceListAddress } from "../../shared/routing/routes";
 
 /** The user's account: password, storage, other sessions, API keys and audit log. */
-export function AccountPage({ api, fleet }: { api: Api; fleet: Fleet }) {
+export function AccountPage({ api, fleet, account }: { api: Api; fleet: Fleet; account: Account }) {
   const [changes, setChanges] = useState(0);
   return (
     <main class="page fleet" id="content">
       <a href={deviceListAddress}>← {common.allDevices}</a>
       <h1>{texts.account.title}</h1>
+      <p>{texts.account.identity(accountLabel(account.name, account.id))}</p>
       <p>
         <a href={auditLogAddress}>{texts.audit.link}</a>
       </p>

@@ -30,6 +30,7 @@ export const texts = {
 
   account: {
     title: "Your account",
+    identity: (label: string): string => `Other accounts see you as ${label}. Names can look alike; the code after # is yours only.`,
     password: "Password",
     passwordExplained:
       "At least twelve characters; a sentence of a few words works well. All your other sessions end. Within ten minutes of opening a sign-in link, the old password can stay empty.",

@@ -1,5 +1,6 @@
 import type { DeviceStore } from "../devices/model";
-import { useId, useState } from "preact/hooks";
+import { useEffect, useId, useState } from "preact/hooks";
+import { accountLabel } from "../../shared/lib/account-label";
 import type { Control } from "./model/lease";
 import type { StopSwitch } from "./model/stop";
 import type { Watchers } from "./model/watchers";
@@ -24,6 +25,7 @@ export function ControlBar({ device, control, stop, watchers }: ControlBarProps)
   const [takingOver, setTakingOver] = useState(false);
   const opener = useReturnFocus(takingOver);
   const isViewer = device.info.value.role === "viewer";
+  useAccountIds(device);
   return (
     <div class="control-bar" role="region" aria-label={texts.control.title}>
       <ControlState device={device} control={control} />
@@ -56,6 +58,16 @@ export function ControlBar({ device, control, stop, watchers }: ControlBarProps)
       {watchers !== undefined && open && <WatcherNames watchers={watchers} id={names} />}
     </div>
   );
+}
+
+/** Asks the cloud who has and who requests control, because the device reports only names. */
+function useAccountIds(device: DeviceStore): void {
+  const holder = device.holder.value;
+  const request = device.request.value;
+  const unknown = (holder !== null && !holder.mine && holder.account === "") || request?.account === "";
+  useEffect(() => {
+    if (unknown) void device.refreshLease();
+  }, [device, unknown, device.state.value?.epoch, request?.id]);
 }
 
 /** Whether another operator has control, so that this page must request it. */
@@ -116,13 +128,14 @@ function describe(device: DeviceStore, control: Control): [Shown, string] {
   const holder = device.holder.value;
   const lease = device.state.value?.lease ?? null;
   const reason = lease !== null && lease.holder === holder?.name ? (lease.reason ?? "") : "";
+  const name = holder === null ? "" : accountLabel(holder.name, holder.account);
   switch (state.kind) {
     case "taking":
       return ["taking", texts.control.taking];
     case "held":
       return ["mine", state.confirmed ? texts.control.mine : texts.control.unconfirmed];
     case "lost":
-      return ["lost", texts.control.lost(holder === null || reason === "" ? state.reason : texts.control.tookOver(holder.name, reason))];
+      return ["lost", texts.control.lost(holder === null || reason === "" ? state.reason : texts.control.tookOver(name, reason))];
     case "refused":
       return ["refused", texts.control.refused(state.reason)];
     case "handed":
@@ -130,6 +143,6 @@ function describe(device: DeviceStore, control: Control): [Shown, string] {
     case "none":
       if (holder === null) return ["free", texts.control.free];
       if (holder.mine) return ["other", texts.control.elsewhere];
-      return ["other", reason === "" ? texts.control.other(holder.name) : texts.control.tookOver(holder.name, reason)];
+      return ["other", reason === "" ? texts.control.other(name) : texts.control.tookOver(name, reason)];
   }
 }

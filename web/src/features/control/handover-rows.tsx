@@ -3,6 +3,7 @@ import type { DeviceStore } from "../devices/model";
 import { useComputed } from "@preact/signals";
 import { useEffect, useId, useRef, useState } from "preact/hooks";
 import type { ControlRequestState } from "./model/control-request";
+import { accountLabel } from "../../shared/lib/account-label";
 import { clock } from "../../shared/lib/clock";
 import type { Control } from "./model/lease";
 import { texts } from "./texts";
@@ -94,17 +95,18 @@ export function AnswerRequest({ control }: { control: Control }) {
     }
   }, [request?.id]);
 
+  const requester = request === null ? "" : accountLabel(request.by, request.account);
   const message = response.kind === "kept" ? texts.handover.declined(response.from) : "";
   return (
     <>
       <div role="alert" class={request === null ? undefined : "bar-row incoming-request"} data-testid="incoming-request">
-        {request !== null && <strong>{texts.handover.requests(request.by)}</strong>}
+        {request !== null && <strong>{texts.handover.requests(requester)}</strong>}
         {request !== null && <span class="quiet small">{texts.handover.effect}</span>}
       </div>
       {request !== null && (
-        <div class="bar-row" role="group" aria-label={texts.handover.requests(request.by)}>
+        <div class="bar-row" role="group" aria-label={texts.handover.requests(requester)}>
           <button type="button" class="primary" data-testid="accept-request" disabled={sending} onClick={() => void control.respond(true)}>
-            {sending && response.accept ? texts.handover.accepting : texts.handover.accept(request.by)}
+            {sending && response.accept ? texts.handover.accepting : texts.handover.accept(requester)}
           </button>
           <button type="button" data-testid="refuse-request" disabled={sending} onClick={() => void control.respond(false)}>
             {sending && !response.accept ? texts.handover.declining : texts.handover.decline}
@@ -132,6 +134,7 @@ export function TakeOverForm({ device, control, onClose }: TakeOverProps) {
   const id = useId();
   const [reason, setReason] = useState("");
   const field = useRef<HTMLInputElement>(null);
+  const holder = device.holder.value;
   useEffect(() => field.current?.focus(), []);
   return (
     <form
@@ -141,7 +144,7 @@ export function TakeOverForm({ device, control, onClose }: TakeOverProps) {
         void control.takeOver(reason.trim()).then(onClose);
       }}
     >
-      <label for={id}>{texts.handover.reason(device.holder.value?.name ?? "")}</label>
+      <label for={id}>{texts.handover.reason(holder === null ? "" : accountLabel(holder.name, holder.account))}</label>
       <input
         id={id}
         ref={field}

@@ -1,5 +1,6 @@
 /** Number and names of the other viewers, while the server's list is current. */
 import { Age } from "../../shared/ui/age";
+import { shortId } from "../../shared/lib/account-label";
 import { toPageClock } from "../../shared/lib/clock";
 import type { Watchers } from "./model/watchers";
 import { common } from "../../shared/i18n/common";
@@ -36,10 +37,10 @@ export function WatcherNames({ watchers, id }: { watchers: Watchers; id: string 
   if (others.length === 0) return null;
   return (
     <ul class="bar-row watcher-names" id={id} aria-label={texts.watchers.title} data-testid="watcher-names">
-      {others.map(({ name, role, mine, since }, index) => (
+      {others.map(({ name, account, role, mine, since }, index) => (
         <li key={index}>
           {name} <span class="quiet small">
-            {mine ? texts.watchers.mine : common.role[role].toLowerCase()}, <Age at={toPageClock(Date.parse(since))} as={texts.watchers.since} />
+            {shortId(account)}, {mine ? texts.watchers.mine : common.role[role].toLowerCase()}, <Age at={toPageClock(Date.parse(since))} as={texts.watchers.since} />
           </span>
         </li>
       ))}

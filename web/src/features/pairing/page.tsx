@@ -1,5 +1,5 @@
 /** Pairs an agent by its code or link with a space, then names its devices. */
-import type { Device, Space } from "../../shared/api/types";
+import type { Account, Device, Space } from "../../shared/api/types";
 import { LastSeenAge, ReachChip, RenameDevice } from "../devices";
 import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
@@ -8,17 +8,19 @@ import type { Api } from "../../shared/api/client";
 import { ApiError, sentence } from "../../shared/api/http";
 import { readCode, type FollowedCode } from "./model/claim-code";
 import { common } from "../../shared/i18n/common";
+import { accountLabel } from "../../shared/lib/account-label";
 import { texts } from "./texts";
 import "./pairing.css";
 import { deviceAddress, deviceListAddress } from "../../shared/routing/routes";
 
 interface PairingPageProps {
   api: Api;
+  account: Account;
   fleet: Fleet;
   pairing: FollowedCode;
 }
 
-export function PairingPage({ api, fleet, pairing }: PairingPageProps) {
+export function PairingPage({ api, account, fleet, pairing }: PairingPageProps) {
   const [paired, setPaired] = useState<readonly Device[] | null>(null);
   return (
     <main class="page pairing" id="content">
@@ -29,6 +31,7 @@ export function PairingPage({ api, fleet, pairing }: PairingPageProps) {
       {paired === null ? (
         <PairForm
           api={api}
+          account={account}
           fleet={fleet}
           pairing={pairing}
           onPaired={(devices) => {
@@ -50,7 +53,7 @@ interface PairFormProps extends PairingPageProps {
 }
 
 /** A link never claims a code without a click. Input stays until the pairing succeeds. */
-function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
+function PairForm({ api, account, fleet, pairing, onPaired }: PairFormProps) {
   const linked = pairing.code.value;
   const [typed, setTyped] = useState(linked ?? "");
   const [spaces, setSpaces] = useState<readonly Space[] | null>(null);
@@ -103,6 +106,7 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
   return (
     <Card title={texts.byCode}>
       <p class="quiet">{linked === null ? texts.explain : texts.linked}</p>
+      <p class="quiet">{texts.into(accountLabel(account.name, account.id))}</p>
       <form
         class="fields"
         onSubmit={(event) => {

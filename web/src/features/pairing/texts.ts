@@ -6,6 +6,7 @@ export const texts = {
   explain:
     "Enter the code that the agent shows when it starts. It is valid for five minutes. If the terminal shows a QR code, scan it with a phone’s camera to open this page.",
   linked: "You followed a pairing link. Pair only an agent that you, or a person you trust, started.",
+  into: (account: string): string => `The agent will belong to your account, ${account}, and its terminal will show that name.`,
   code: "Claim code",
   example: "BCDF-GHJK",
   space: "Space",

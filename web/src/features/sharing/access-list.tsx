@@ -9,6 +9,7 @@ import { secondsLeft, ShareList } from "./model/shares";
 import type { Transferable } from "../../shared/api/transfers";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
+import { accountLabel, shortId } from "../../shared/lib/account-label";
 import { texts } from "./texts";
 import { InlineForm } from "../../shared/ui/inline-form";
 import { ConfirmButton } from "../../shared/ui/confirm-button";
@@ -71,7 +72,7 @@ function OwnAccess({ api, account, target, owner, role, onLeft }: PartProps & { 
   };
   return (
     <Card title={texts.access.title}>
-      <p>{texts.access.owned(owner.name, common.role[role])}</p>
+      <p>{texts.access.owned(accountLabel(owner.name, owner.id), common.role[role])}</p>
       <ConfirmButton
         label={texts.access.leave}
         question={texts.access.leaveQuestion}
@@ -121,7 +122,7 @@ function OwnerView({ api, target, owner, space }: PartProps) {
       <ul class="people" data-testid="people">
         <li>
           <span class="person">
-            {owner.name} <span class="quiet">({texts.access.you})</span>
+            {owner.name} <span class="quiet">{shortId(owner.id)} ({texts.access.you})</span>
           </span>
           <span class="chip">{common.role.owner}</span>
         </li>
@@ -195,7 +196,7 @@ function PersonRow({ share, sharing }: { share: Share; sharing: ShareList }) {
       <span class="person">
         {name}
         <span class="quiet small">
-          {format.until(share.expires_at)} · {texts.access.since(share.created_by, share.created_at)}
+          {shortId(share.account.id)} · {format.until(share.expires_at)} · {texts.access.since(share.created_by, share.created_at)}
         </span>
       </span>
       <span class={`chip role-${share.role}`} title={texts.roleExplained[share.role]}>
@@ -357,7 +358,9 @@ function ThroughSpace({ api, space }: { api: Api; space: { id: string; name: str
           <li key={share.account.id}>
             <span class="person">
               {share.account.name}
-              <span class="quiet small">{format.until(share.expires_at)}</span>
+              <span class="quiet small">
+                {shortId(share.account.id)} · {format.until(share.expires_at)}
+              </span>
             </span>
             <span class={`chip role-${share.role}`}>{common.role[share.role]}</span>
           </li>

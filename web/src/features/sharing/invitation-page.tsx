@@ -7,6 +7,7 @@ import { ApiError, sentence } from "../../shared/api/http";
 import type { FollowedInvitation } from "./model/invitation-link";
 import type { Invitation } from "../../shared/api/sharing";
 import { common } from "../../shared/i18n/common";
+import { accountLabel } from "../../shared/lib/account-label";
 import { texts } from "./texts";
 import { ConfirmButton } from "../../shared/ui/confirm-button";
 import { deviceAddress, deviceListAddress, replaceWith, spaceAddress } from "../../shared/routing/routes";
@@ -93,8 +94,8 @@ function Offer({ api, fleet, account, followed, secret, away, onAccepted }: Offe
     offer === null
       ? texts.invitation.title
       : isTransfer
-        ? texts.invitation.offersOwnership(offer.created_by, offer.label)
-        : texts.invitation.offers(offer.created_by, offer.label);
+        ? texts.invitation.offersOwnership(accountLabel(offer.created_by, offer.created_by_account), offer.label)
+        : texts.invitation.offers(accountLabel(offer.created_by, offer.created_by_account), offer.label);
   return (
     <>
       <h1>{title}</h1>
@@ -116,7 +117,7 @@ function Offer({ api, fleet, account, followed, secret, away, onAccepted }: Offe
           </select>
         </div>
       )}
-      <p class="quiet">{texts.invitation.as(account.name)}</p>
+      <p class="quiet">{texts.invitation.as(accountLabel(account.name, account.id))}</p>
       <div role="alert">{failure !== null && <p class="notice bad">{failure.text}</p>}</div>
       <div class="row">
         {offer !== null && isTransfer && failure?.final !== true && (

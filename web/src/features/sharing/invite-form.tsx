@@ -5,6 +5,7 @@ import type { CreatedInvitation, SharedRole } from "../../shared/api/sharing";
 import type { ShareList } from "./model/shares";
 import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
+import { accountLabel } from "../../shared/lib/account-label";
 import { texts } from "./texts";
 import { AccountNameField, InlineForm } from "../../shared/ui/inline-form";
 import { NO_EXPIRY, DurationPicker, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
@@ -53,7 +54,7 @@ export function InviteForm({ sharing, onClose }: InviteFormProps) {
     try {
       if (method === "name") {
         const share = await sharing.share(name.trim(), role, forS);
-        setMessage(texts.invite.shared(share.account.name));
+        setMessage(texts.invite.shared(accountLabel(share.account.name, share.account.id)));
         setName("");
       } else {
         const validS = seconds(valid) ?? 0; // All its choices are durations.

@@ -7,6 +7,7 @@ import { sentence } from "../../shared/api/http";
 import type { Invitation, CreatedInvitation } from "../../shared/api/sharing";
 import type { Transferable } from "../../shared/api/transfers";
 import { format } from "../../shared/i18n/format";
+import { accountLabel } from "../../shared/lib/account-label";
 import { texts } from "./texts";
 import { AccountNameField, InlineForm } from "../../shared/ui/inline-form";
 import { ConfirmButton } from "../../shared/ui/confirm-button";
@@ -83,7 +84,7 @@ interface OpenOfferProps {
 }
 
 function OpenOffer({ offer: { account, expires_at: until }, withdraw, onWithdrawn }: OpenOfferProps) {
-  const name = texts.transfer.offered(account?.name ?? null);
+  const name = texts.transfer.offered(account === null ? null : accountLabel(account.name, account.id));
   return (
     <li>
       <span class="person">

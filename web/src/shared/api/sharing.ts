@@ -31,6 +31,7 @@ export interface Invitation {
   label: string;
   role: Role;
   created_by: string;
+  created_by_account: string;
   uses: number;
   /** Duration of the role after acceptance [s]; `null`: no expiry. */
   share_s: number | null;

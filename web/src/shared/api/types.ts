@@ -37,6 +37,7 @@ export interface SignInSession {
 export interface ControlRequestInfo {
   id: string;
   requester: string;
+  requester_account: string;
   epoch: number;
   mine: boolean;
   requested_at: string;
@@ -46,6 +47,7 @@ export interface ControlRequestInfo {
 
 export interface Lease {
   holder: string;
+  holder_account: string;
   epoch: number;
   expires_at: string;
   mine: boolean;
@@ -58,6 +60,7 @@ export interface Lease {
 /** Another viewer of a device. `mine`: this account in another session. */
 export interface Watcher {
   name: string;
+  account: string;
   role: Role;
   mine: boolean;
   since: string;

@@ -23,7 +23,7 @@ function granted(epoch: number, confirmed = true, streaming = true): Answer {
 
 function request(outcome: ControlRequestInfo["outcome"] = "open"): ControlRequestInfo {
   const [requested, expires] = [0, 30_000].map((after) => new Date(Date.now() + after).toISOString());
-  return { id: "r1", requester: "Bob", epoch: 5, mine: true, requested_at: requested ?? "", expires_at: expires ?? "", outcome };
+  return { id: "r1", requester: "Bob", requester_account: "bob-id", epoch: 5, mine: true, requested_at: requested ?? "", expires_at: expires ?? "", outcome };
 }
 
 let setpoints: FakeLink;
@@ -183,7 +183,7 @@ describe("a request for control", () => {
   const requestState = (): ControlRequestState => control.outgoingRequest.state.value;
 
   beforeEach(() => {
-    device.setLease({ holder: "Ann", epoch: 5, expires_at: EXPIRES, mine: false });
+    device.setLease({ holder: "Ann", holder_account: "ann-id", epoch: 5, expires_at: EXPIRES, mine: false });
     answer = ok(request());
     server.on(`POST ${LEASE}/requests`, () => ok({ request: request(), confirmed: true }));
     server.on(`GET ${REQUEST}`, () => (typeof answer === "function" ? answer() : answer));
@@ -268,7 +268,7 @@ describe("the holder's response to a request", () => {
   });
 
   it("is possible while the robot reports the request", () => {
-    expect(control.incomingRequest.value).toMatchObject({ id: "r1", by: "Bob" });
+    expect(control.incomingRequest.value).toMatchObject({ id: "r1", by: "Bob", account: "" });
     expect((control.incomingRequest.value?.until ?? 0) - performance.now()).toBeCloseTo(20_000, -2);
     deliver("state", state(5, "Ann"));
     expect(control.incomingRequest.value).toBeNull();
@@ -276,8 +276,8 @@ describe("the holder's response to a request", () => {
 
   it("is possible for a request that only the cloud reports", () => {
     deliver("state", state(4, "Ann"));
-    device.setLease({ holder: "Ann", epoch: 5, expires_at: EXPIRES, mine: true, request: request() });
-    expect(control.incomingRequest.value).toMatchObject({ id: "r1", by: "Bob" });
+    device.setLease({ holder: "Ann", holder_account: "ann-id", epoch: 5, expires_at: EXPIRES, mine: true, request: request() });
+    expect(control.incomingRequest.value).toMatchObject({ id: "r1", by: "Bob", account: "bob-id" });
   });
 
   it("hands control over and ends the stream; the new operator's lease is not released", async () => {
@@ -308,7 +308,7 @@ describe("the holder's response to a request", () => {
 
 describe("the other viewers", () => {
   it("are read while the page is visible; unknown ones are not shown", async () => {
-    const bob: Watcher = { name: "Bob", role: "viewer", mine: false, since: "2026-01-01T00:00:00.000Z" };
+    const bob: Watcher = { name: "Bob", account: "bob-id", role: "viewer", mine: false, since: "2026-01-01T00:00:00.000Z" };
     const viewers = `/devices/${DEVICE}/viewers`;
     server.on(`PUT ${viewers}`, ok({ ...(list(bob).body as object), refresh_ms: 10_000 }));
     server.on(`DELETE ${viewers}`, none);

@@ -61,12 +61,12 @@ describe("a device", () => {
 describe("the lease holder", () => {
   it("is reported by the robot, unless the cloud has a newer lease or the robot sends nothing", async () => {
     const lease = (epoch: number, inMs: number): void =>
-      device.setLease({ holder: "Cloud", epoch, expires_at: new Date(Date.now() + inMs).toISOString(), mine: false });
+      device.setLease({ holder: "Cloud", holder_account: "cloud-id", epoch, expires_at: new Date(Date.now() + inMs).toISOString(), mine: false });
     deliver("state", state(3, "Ann"));
     lease(2, 60_000);
     expect(device.holder.value?.name).toBe("Ann");
     lease(4, 60_000);
-    expect(device.holder.value?.name).toBe("Cloud");
+    expect(device.holder.value).toMatchObject({ name: "Cloud", account: "cloud-id" });
     lease(4, -5_000);
     expect(device.holder.value?.name).toBe("Ann");
     deliver("state", state(3));

@@ -166,7 +166,7 @@ export class Control {
     const { epoch } = granted;
     this.#epochReported = false;
     this.#response.value = { kind: "none" };
-    this.#device.setLease({ holder: granted.holder, epoch, expires_at: granted.expires_at, mine: true });
+    this.#device.setLease({ holder: granted.holder, holder_account: "", epoch, expires_at: granted.expires_at, mine: true });
     this.roundTrip.restart();
     const link = granted.streaming ? this.#openLink(this.#device.id, epoch) : null;
     const topic = this.#device.topics.ctl(epoch);

@@ -35,9 +35,18 @@ interface MeasuredValues extends Timed<Measurements> {
   everyMs: number | null;
 }
 
+/** `account`: empty while only the device has reported the lease, because devices know names only. */
+interface LeaseHolder {
+  name: string;
+  account: string;
+  mine: boolean;
+}
+
 export interface OpenRequest {
   id: string;
   by: string;
+  /** Id of the requester; empty until the cloud has stated it. */
+  account: string;
   until: number;
 }
 
@@ -128,14 +137,14 @@ export class DeviceStore {
    * The lease holder; `null`: none. The device enforces the lease that it has received, so its report takes precedence over the
    * cloud's, unless the cloud has a newer epoch.
    */
-  readonly holder = computed<{ name: string; mine: boolean } | null>(() => {
+  readonly holder = computed<LeaseHolder | null>(() => {
     const lease = this.#lease.value;
     const reported = this.live.value ? this.#state.value : null;
     const current = lease !== null && toPageClock(Date.parse(lease.expires_at)) > clock.value ? lease : null;
     if (reported !== null && (current === null || current.epoch < reported.epoch)) {
-      return reported.lease === null ? null : { name: reported.lease.holder, mine: false };
+      return reported.lease === null ? null : { name: reported.lease.holder, account: "", mine: false };
     }
-    return current === null ? null : { name: current.holder, mine: current.mine };
+    return current === null ? null : { name: current.holder, account: current.holder_account, mine: current.mine };
   });
 
   /**
@@ -147,10 +156,13 @@ export class DeviceStore {
     const lease = this.#lease.value;
     if (reported !== null && reported.epoch >= (lease?.epoch ?? 0)) {
       const { request } = reported;
-      return request ? { id: request.id, by: request.requester, until: this.#stateAt + request.expires_in_ms } : null;
+      if (!request) return null;
+      const account = lease?.request?.id === request.id ? lease.request.requester_account : "";
+      return { id: request.id, by: request.requester, account, until: this.#stateAt + request.expires_in_ms };
     }
     const request = lease?.request ?? null;
-    return request === null ? null : { id: request.id, by: request.requester, until: toPageClock(Date.parse(request.expires_at)) };
+    if (request === null) return null;
+    return { id: request.id, by: request.requester, account: request.requester_account, until: toPageClock(Date.parse(request.expires_at)) };
   });
 
   constructor(info: Device, api: Api, link: Link) {
