@@ -160,8 +160,8 @@ def _device(text: str) -> DeviceEntry:
         raise ConfigError(f"'{robot_type}' is not a robot type; known: {', '.join(known)}")
     if robot_type not in known:
         print(
-            f"robot type '{robot_type}' is not on this machine (known: {', '.join(known)}); `run` downloads it from the "
-            "account that redeems the claim code",
+            f"robot type '{robot_type}' is not on this machine (known: {', '.join(known)}); `run` downloads it from "
+            "the account that redeems the claim code",
             flush=True,
         )
     if driver:

@@ -2,7 +2,7 @@ import type { Account } from "../../shared/api/types";
 import { accountLabel } from "../../shared/lib/account-label";
 import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
-import { useState } from "preact/hooks";
+import { useEffect, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import { common } from "../../shared/i18n/common";
