@@ -48,6 +48,8 @@ from device_agent.runtime.telemetry.device_publisher import DevicePublisher, Sta
 _FUTURE_MS = 2000
 """Tolerance for commands issued in the future; larger than the error of the clock estimate [ms]."""
 _MAX_WAITING = 1000
+_IDLE_S, _CONFIRM_S = 0.1, 0.01
+"""Time between two checks of state and events, and of a Stop that the control loop has not applied yet [s]."""
 _log = logging.getLogger(__name__)
 
 
@@ -82,6 +84,7 @@ class CommandProcessor:
         self._load = load
         self._device_faults = device_faults
         self._control_request = PendingControlRequest()
+        self._pending_stops: dict[str, int] = {}
         self._twin: Twin | None = None
         self._commands: queue.Queue[bytes] = queue.Queue(maxsize=_MAX_WAITING)
         self._connected = threading.Event()
@@ -118,10 +121,10 @@ class CommandProcessor:
     def _run(self) -> None:
         while not self._stopping.is_set():
             with contextlib.suppress(queue.Empty):
-                payload = self._commands.get(timeout=0.1)
+                payload = self._commands.get(timeout=_CONFIRM_S if self._pending_stops else _IDLE_S)
                 self._guarded(partial(self._process, payload))
             # Guarded separately: with a full disk, state and events are still published.
-            for step in (self._write_journal, self._publish_state, self._publish_events):
+            for step in (self._write_journal, self._confirm_stops, self._publish_state, self._publish_events):
                 self._guarded(step)
         self._guarded(self._write_journal)
         self._guarded(partial(self._publish_events, last=True))
@@ -235,8 +238,10 @@ class CommandProcessor:
                 self._controller.release(epoch=command.epoch)
             case StopDevice(reason=reason):
                 latch = StopLatch(caller=command.caller, reason=printable(reason), at_ms=wall_ms(), verified=True)
-                self._controller.stop(latch)
+                self._pending_stops[command.id] = self._controller.stop(latch)
                 self._wake()
+                self._confirm_stops()
+                return
             case ResetStop():
                 self._reset_stop(command)
             case RotateKey(statements=statements):
@@ -252,9 +257,20 @@ class CommandProcessor:
         self._write_journal()
         self._publisher.report(command.id, AckStatus.DONE)
 
+    def _confirm_stops(self) -> None:
+        """Acknowledge each Stop that the control loop has applied. Without the loop, no Stop is acknowledged."""
+        self._write_journal()
+        for command, number in list(self._pending_stops.items()):
+            if self._controller.stop_applied(number):
+                self._publisher.report(command, AckStatus.DONE)
+                del self._pending_stops[command]
+
     def _reset_stop(self, command: Command) -> None:
         was_latched = self._controller.latch is not None
         self._controller.reset_stop(epoch=command.epoch)
+        reset = Reason(code="reset", message="Stop was reset before the control loop had applied it")
+        while self._pending_stops:
+            self._publisher.report(self._pending_stops.popitem()[0], AckStatus.FAILED, reason=reset)
         message = f"Stop was reset by {command.caller}"
         if was_latched:
             self._events.record(EventRecord(EventKind.STOP_RESET, message, data={"caller": command.caller}))
@@ -287,7 +303,7 @@ class CommandProcessor:
         epoch, ended = self._controller.epochs
         lease = self._controller.lease(now_s)
         return StateSnapshot(
-            mode=self._controller.mode,
+            mode=self._controller.applied_mode,
             epoch=epoch,
             ended=ended,
             lease=lease,

@@ -25,7 +25,10 @@ _SAME_TWIST = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class ControlOutput:
-    """Output of one period. ``position_rad`` and ``twist`` are motor commands; the rest is for telemetry."""
+    """Output of one period. ``position_rad`` and ``twist`` are motor commands; the rest is for telemetry.
+
+    ``stops``: number of Stops received before this period.
+    """
 
     position_rad: list[float]
     mode: Mode
@@ -35,6 +38,7 @@ class ControlOutput:
     loop_age_ms: float
     limited: tuple[str, ...]
     twist: Twist = REST
+    stops: int = 0
 
 
 class CommandArbiter:
@@ -79,6 +83,7 @@ class CommandArbiter:
             state.stream.loop_age_ms,
             limited,
             state.goals.twist,
+            state.stops,
         )
 
     def record_applied(self, position_rad: Sequence[float]) -> None:

@@ -165,6 +165,7 @@ class ControlLoop:
             self._controller.record_applied(applied)
             if self._base is not None:
                 self._controller.record_driven(output.twist, self._base.drive(output.twist))
+            self._controller.record_period(output)
             self._publish_telemetry(now_s, observation, output, applied)
         except DriverError as error:
             self._error = str(error)
@@ -185,7 +186,7 @@ class ControlLoop:
     def _handle_fault(self) -> None:
         _log.error("%s: %s", self._name, self._error)
         self._controller.set_fault(self._error)
-        self._controller.update(time.monotonic())
+        self._controller.record_period(self._controller.update(time.monotonic()))
         while not self._stopping.wait(_RECONNECT_PERIOD_S):
             with contextlib.suppress(DriverError):
                 self._driver.connect()

@@ -15,7 +15,12 @@ from device_agent.runtime.errors import Refused
 
 
 class ControlState:
-    """Everything that the controller's lock protects; see ``Controller`` for the arguments."""
+    """Everything that the controller's lock protects; see ``Controller`` for the arguments.
+
+    Attributes:
+        mode: Mode of the last period.
+        stops: Number of received Stops.
+    """
 
     def __init__(
         self,
@@ -33,6 +38,7 @@ class ControlState:
         self.stiffness = JointStiffness(robot_type)
         self.authority = Authority(gate, latch, hold=self._hold, record=record)
         self.mode = Mode.IDLE
+        self.stops = 0
 
     def _hold(self, why: Refused) -> None:
         """Bring the device to rest after the right to move has ended."""

@@ -53,6 +53,7 @@ class Controller:
         self._arbiter = CommandArbiter(robot_type, self._state)
         self.changed = self._state.authority.changed
         self._lock = threading.Lock()
+        self._applied: ControlOutput | None = None
 
     # ------------------------------------------------------------ leases, Stop, faults
 
@@ -100,10 +101,12 @@ class Controller:
         with self._lock:
             self._state.authority.restrictions.clear(source)
 
-    def stop(self, latch: StopLatch) -> None:
-        """Latch Stop; see ``Authority.stop``."""
+    def stop(self, latch: StopLatch) -> int:
+        """Latch Stop; returns its number for ``stop_applied``. See ``Authority.stop``."""
         with self._lock:
             self._state.authority.stop(latch)
+            self._state.stops += 1
+            return self._state.stops
 
     def reset_stop(self, *, epoch: int) -> None:
         """Release the latch. Nothing resumes: every lease up to ``epoch``, that of the reset, has ended.
@@ -263,6 +266,18 @@ class Controller:
         """Whether Stop is latched but no period has applied it yet."""
         return self._state.authority.latch is not None and self._state.mode not in {Mode.STOPPED, Mode.FAULT}
 
+    def stop_applied(self, number: int) -> bool:
+        """Whether the device has accepted a period that began after this Stop was latched."""
+        applied = self._applied
+        return applied is not None and applied.mode is Mode.STOPPED and applied.stops >= number
+
+    @property
+    def applied_mode(self) -> Mode:
+        """Mode of the last period that the device accepted: a period that hangs in the driver does not count."""
+        if self._state.authority.fault is not None:
+            return Mode.FAULT
+        return Mode.IDLE if self._applied is None else self._applied.mode
+
     @property
     def fault(self) -> str | None:
         """Error message of the driver."""
@@ -331,6 +346,10 @@ class Controller:
         """
         with self._lock:
             return self._arbiter.update(now_s, measured_rad, elapsed_s)
+
+    def record_period(self, output: ControlOutput) -> None:
+        """Record that the device has accepted all commands of this period. Only the control loop calls this."""
+        self._applied = output
 
     def record_applied(self, position_rad: Sequence[float]) -> None:
         """Record the positions that the driver applied, shape (n,) [rad]; ``limited`` shows differences."""

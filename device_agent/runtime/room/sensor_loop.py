@@ -16,6 +16,7 @@ from device_agent.ports.sensor import Camera, Reducible, SensorError
 from device_agent.protocol import MAX_VALUES, Measurements, Mode
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
+from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.room.room_device import RoomDevice
 
@@ -97,7 +98,7 @@ class SensorLoop:
                     self._room_device.watchdog.reset()
                     self._controller.clear_fault(())
                 self._check_interlocks(now_s)
-                self._apply_mode(self._controller.update(now_s).mode)
+                self._apply(self._controller.update(now_s))
                 if self._reducible is not None:
                     self._reducible.reduce(self._room_device.load.share("perception"))
                 for source in self._sources:
@@ -121,11 +122,13 @@ class SensorLoop:
             for source in self._sources:  # a faster rate applies immediately
                 source.due_s = min(source.due_s, now_s + 1 / self._room_device.rate_hz(source.name))
 
-    def _apply_mode(self, mode: Mode) -> None:
-        """Hold moving parts on a Stop, a hold or a fault."""
-        was_held, self._held = self._held, mode in _HOLD_MODES
-        if self._held and not was_held:
+    def _apply(self, output: ControlOutput) -> None:
+        """Hold moving parts on a Stop, a hold or a fault. A hold that failed is repeated."""
+        holds = output.mode in _HOLD_MODES
+        if holds and not self._held:
             self._room_device.hold()
+        self._held = holds
+        self._controller.record_period(output)
 
     def _read(self, source: _Source, now_s: float) -> None:
         """Read one source. Missed readings are dropped."""
@@ -164,4 +167,4 @@ class SensorLoop:
         _log.error("%s: %s", self._name, message)
         self._controller.set_fault(message)
         with contextlib.suppress(SensorError):
-            self._apply_mode(self._controller.update(time.monotonic()).mode)
+            self._apply(self._controller.update(time.monotonic()))
