@@ -95,4 +95,5 @@ class ActionServices(ControlServices):
             queues=self.queues,
             delivery=self.delivery,
             control_events=self.control_events,
+            clock=self.clock,
         )

@@ -8,6 +8,7 @@ import contextlib
 import logging
 from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Final
 
 from device_agent.protocol import ResetStop, Stop, StopDevice, codec
@@ -18,12 +19,13 @@ from function_app.domain.control import lease as rules
 from function_app.domain.control.control_events import Fact
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
+from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import StoreError
 from function_app.services.actions.queue import ActionQueues
 from function_app.services.control.control_events import ControlEvents
 from function_app.services.control.lease_store import LeaseStore
-from function_app.services.devices.device_access import DeviceAccess, require_operator
+from function_app.services.devices.device_access import DeviceAccess, require_online, require_operator
 from function_app.services.devices.spaces import Spaces
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.messaging.delivery import Delivery
@@ -36,12 +38,23 @@ MAX_CONCURRENT: Final = 16
 _log = logging.getLogger(__name__)
 
 
+class StopOutcome(StrEnum):
+    """What is known about a Stop one second after it was sent."""
+
+    CONFIRMED = "confirmed"
+    """The control loop of the device has applied it."""
+    SENT = "sent"
+    """It was sent, but the control loop has not confirmed it: the device may still move."""
+    UNREACHABLE = "unreachable"
+    """The agent of the device is offline, or the broker cannot be reached: the device may still move."""
+
+
 @dataclass(frozen=True, slots=True)
 class StopResult:
-    """The result of Stop on one device: confirmed by the device, or the error."""
+    """The result of Stop on one device. ``problem``: why nothing could be sent."""
 
     device: str
-    confirmed: bool
+    outcome: StopOutcome
     problem: Problem | None = None
 
 
@@ -58,6 +71,7 @@ class StopDevices:
         queues: ActionQueues,
         delivery: Delivery,
         control_events: ControlEvents,
+        clock: Clock,
     ) -> None:
         self._devices = devices
         self._spaces = spaces
@@ -66,19 +80,20 @@ class StopDevices:
         self._queues = queues
         self._delivery = delivery
         self._control_events = control_events
+        self._clock = clock
 
-    async def stop(self, caller: Identity, device_id: str, reason: str) -> bool:
-        """Latch Stop; return whether the device confirmed it within one second.
+    async def stop(self, caller: Identity, device_id: str, reason: str) -> StopResult:
+        """Latch Stop; return what is known about it after at most one second.
 
         Publishes the plain ``stop`` message until confirmed, and a signed command. Cancels all queued actions.
 
         Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``: neither message was sent.
+            Problem: ``device-unknown``, ``forbidden``.
         """
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "stop"):
             require_operator(device)
-        return await self._stop(caller, device, reason, nullcontext())
+        return await self._one(caller, device, reason, nullcontext())
 
     async def stop_many(self, caller: Identity, reason: str, *, space: str | None = None) -> list[StopResult]:
         """Stop all devices that ``caller`` may operate, in one space or in all, each with its own result.
@@ -118,16 +133,33 @@ class StopDevices:
             device, ResetStop(), caller=caller.name, epoch=lease.epoch, wait_ms=CONFIRM_MS
         )
 
-    async def _one(self, caller: Identity, device: Device, reason: str, gate: asyncio.Semaphore) -> StopResult:
+    async def _one(
+        self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
+    ) -> StopResult:
         try:
-            return StopResult(device.id, await self._stop(caller, device, reason, gate))
+            if await self._send(caller, device, reason, gate):
+                return StopResult(device.id, StopOutcome.CONFIRMED)
+            async with gate:
+                offline = await self._is_offline(caller, device)
+            return StopResult(device.id, StopOutcome.UNREACHABLE if offline else StopOutcome.SENT)
         except Problem as problem:
-            return StopResult(device.id, confirmed=False, problem=problem)
+            return StopResult(device.id, StopOutcome.UNREACHABLE, problem)
 
-    async def _stop(
+    async def _is_offline(self, caller: Identity, device: Device) -> bool:
+        """Whether the agent has disconnected or stopped polling. False if that cannot be read."""
+        try:
+            _, link = await self._devices.get_with_link(caller, device.id)
+            require_online(link, self._clock.now_ms())
+        except Problem as problem:
+            return problem.code == "device-offline"
+        except StoreError as error:
+            _log.warning("stop of %s: %s", device.id, error)
+        return False
+
+    async def _send(
         self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
     ) -> bool:
-        """Send the plain message and the signed command; write the tables concurrently."""
+        """Send the plain message and the signed command; return whether the device confirmed. Writes concurrently."""
         plain = asyncio.create_task(self._repeat(device, caller.account, Stop(id=new_id(), reason=reason)))
         writing: asyncio.Task[None] | None = None
         try:

@@ -44,7 +44,7 @@ def require_motion_and_stop(processes: CloudProcesses, device: str) -> None:
     done = processes.anna.post(f"/devices/{device}/actions", move).json()
     assert done["status"] == "done", done
     assert done["result"] == {"position_rad": {"joint_1": pytest.approx(0.2), "joint_2": 0.0}}
-    assert processes.anna.post(f"/devices/{device}/stop").json() == {"confirmed": True}
+    assert processes.anna.post(f"/devices/{device}/stop").json()["outcome"] == "confirmed"
     refused = processes.anna.post(f"/devices/{device}/actions", move).json()
     assert (refused["status"], refused["reason"]["code"]) == ("failed", "stopped"), refused
     assert processes.anna.post(f"/devices/{device}/stop/reset").json() == {"confirmed": True}

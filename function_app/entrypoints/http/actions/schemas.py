@@ -8,6 +8,7 @@ from msgspec import Meta
 from device_agent.protocol import Id, Text
 from function_app.entrypoints.http.framework.schemas import Epoch, Moment, Problem, Request, Response
 from function_app.services.actions.requests import ActionOptions, ActionRequest
+from function_app.services.actions.stop import StopOutcome
 
 MAX_DEVICES = 100
 
@@ -91,18 +92,29 @@ class StopRequest(Request, frozen=True, kw_only=True):
     reason: Text = ""
 
 
-class StopConfirmation(Response, frozen=True, kw_only=True):
-    """Whether the device has confirmed within one second."""
+class ResetConfirmation(Response, frozen=True, kw_only=True):
+    """Whether the device has confirmed the reset within one second."""
 
     confirmed: bool
 
 
 class StopItem(Response, frozen=True, kw_only=True):
-    """The result for one device. ``status`` and ``problem`` are the same as for a single device."""
+    """The result for one device.
+
+    Attributes:
+        status: 200: confirmed; 202: sent or offline; 503: nothing could be sent.
+        outcome: ``confirmed``: the control loop has applied it. ``sent``: no confirmation within one second.
+            ``unreachable``: the agent is offline, or the broker cannot be reached.
+        confirmed: Whether ``outcome`` is ``confirmed``.
+        message: What the outcome means, and what to do.
+        problem: Why nothing could be sent.
+    """
 
     device: str
     status: int
+    outcome: StopOutcome
     confirmed: bool
+    message: str
     problem: Problem | None
 
 

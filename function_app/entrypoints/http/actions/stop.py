@@ -8,7 +8,15 @@ from function_app.entrypoints.http.actions import schemas
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
 from function_app.entrypoints.http.framework.responses import json_response, problem_item, read_or
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.services.actions.stop import StopResult
+from function_app.services.actions.stop import StopOutcome, StopResult
+
+_MESSAGES = {
+    StopOutcome.CONFIRMED: "The control loop of the device has applied the Stop.",
+    StopOutcome.SENT: (
+        "The Stop was sent, but the device has not confirmed it. It may still move. Use its emergency stop."
+    ),
+    StopOutcome.UNREACHABLE: "The device cannot be reached. It may still move. Use its emergency stop.",
+}
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
@@ -16,23 +24,33 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     routes = Routes("control")
 
     @routes.add(
-        "POST /devices/{device}/stop", "Stop a device", schemas.StopConfirmation, 404, optional_body=schemas.StopRequest
+        "POST /devices/{device}/stop",
+        "Stop a device",
+        {200: schemas.StopItem, 202: schemas.StopItem},
+        404,
+        optional_body=schemas.StopRequest,
     )
     async def stop_device(request: Request, device: str) -> Response:
-        """Requires no lease. The Stop stays latched until it is reset."""
-        caller = await auth.account(request)
-        return json_response(
-            schemas.StopConfirmation(confirmed=await functions.stop.stop(caller, device, await _reason(request)))
-        )
+        """Requires no lease. The Stop stays latched until it is reset. Only status 200 means that it is confirmed.
 
-    @routes.add("POST /devices/{device}/stop/reset", "Reset a Stop", schemas.StopConfirmation, 404)
+        503 ``broker-unavailable``, with the outcome ``unreachable``: nothing could be sent.
+        """
+        caller = await auth.account(request)
+        result = await functions.stop.stop(caller, device, await _reason(request))
+        if result.problem is not None:
+            result.problem.extras["outcome"] = result.outcome
+            raise result.problem
+        item = _item(result)
+        return json_response(item, item.status)
+
+    @routes.add("POST /devices/{device}/stop/reset", "Reset a Stop", schemas.ResetConfirmation, 404)
     async def reset_stop(request: Request, device: str) -> Response:
         """Motion does not resume; control must be acquired again.
 
         Only for one device, and only by a person, who must have inspected it. API keys are rejected.
         """
         caller = await auth.account(request)
-        return json_response(schemas.StopConfirmation(confirmed=await functions.stop.reset(caller, device)))
+        return json_response(schemas.ResetConfirmation(confirmed=await functions.stop.reset(caller, device)))
 
     @routes.add(
         "POST /spaces/{space}/stop",
@@ -73,5 +91,13 @@ def _all(results: list[StopResult]) -> Response:
 
 def _item(result: StopResult) -> schemas.StopItem:
     problem = None if result.problem is None else problem_item(result.problem)
-    status = 200 if problem is None else problem.status
-    return schemas.StopItem(device=result.device, status=status, confirmed=result.confirmed, problem=problem)
+    confirmed = result.outcome is StopOutcome.CONFIRMED
+    status = 200 if confirmed else 202 if problem is None else problem.status
+    return schemas.StopItem(
+        device=result.device,
+        status=status,
+        outcome=result.outcome,
+        confirmed=confirmed,
+        message=_MESSAGES[result.outcome],
+        problem=problem,
+    )

@@ -5,23 +5,29 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import ResetStop, StopDevice
+from device_agent.protocol import AckStatus, ResetStop, StopDevice, codec, topics
 from tests.fakes.agent import Robot
 from tests.fakes.broker import MemoryBroker
 from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.network.brokers import Message
 
 TwoRooms = tuple[Person, Robot, Robot, str]
 
 
-def confirmed(answer: Any) -> dict[str, bool]:
-    return {item["device"]: item["confirmed"] for item in answer.json()["items"]}
+def outcomes(answer: Any) -> dict[str, str]:
+    assert all(item["confirmed"] == (item["outcome"] == "confirmed") for item in answer.json()["items"])
+    return {item["device"]: item["outcome"] for item in answer.json()["items"]}
+
+
+def outcome(answer: Any) -> tuple[int, str]:
+    return answer.status_code, answer.json()["outcome"]
 
 
 def test_stop_and_reset_are_sent_and_recorded(anna: Person, robot: Robot) -> None:
     anna.take_lease(robot.device)
     elsewhere = anna.cloud.sign_in("anna")
     answer = elsewhere.post(f"/devices/{robot.device}/stop", {"reason": "smoke"})
-    assert (answer.status_code, answer.json()) == (200, {"confirmed": True})
+    assert outcome(answer) == (200, "confirmed")
     assert robot.stops[0].reason == "smoke"
     assert [command.request for command in robot.received(StopDevice)] == [StopDevice(reason="smoke")]
     assert robot.received(ResetStop) == []
@@ -46,7 +52,7 @@ def test_each_reset_begins_a_new_epoch(anna: Person, robot: Robot) -> None:
 
 def test_the_unsigned_message_is_repeated_until_confirmed(anna: Person, robot: Robot) -> None:
     robot.silent = True
-    assert anna.post(f"/devices/{robot.device}/stop").json() == {"confirmed": False}
+    assert outcome(anna.post(f"/devices/{robot.device}/stop")) == (202, "sent")
     assert len(robot.stops) >= 3
     assert len({stop.id for stop in robot.stops}) == 1
     assert anna.post(f"/devices/{robot.device}/stop/reset").json() == {"confirmed": False}
@@ -56,7 +62,23 @@ def test_an_offline_robot_receives_stop(anna: Person, robot: Robot) -> None:
     robot.publish_presence(online=False)
     problem(anna.post(f"/devices/{robot.device}/stop", {"reason": "x" * 2001}), 422, "invalid")
     assert robot.stops == []
-    assert anna.post(f"/devices/{robot.device}/stop", {"reason": "🛑" * 2000}).json() == {"confirmed": True}
+    assert outcome(anna.post(f"/devices/{robot.device}/stop", {"reason": "🛑" * 2000})) == (200, "confirmed")
+    robot.silent = True
+    assert outcome(anna.post(f"/devices/{robot.device}/stop")) == (202, "unreachable")
+
+
+@pytest.mark.parametrize("first", [AckStatus.RECEIVED, AckStatus.FAILED])
+def test_only_the_ack_of_the_control_loop_confirms(anna: Person, robot: Robot, first: AckStatus) -> None:
+    def hang(message: Message) -> None:
+        before = len(robot.commands)
+        robot.silent = True
+        Robot.handle(robot, message)
+        for command in robot.commands[before:]:
+            assert robot.link is not None
+            robot.link.publish(robot.topic(topics.ACK), codec.encode(robot.ack(command.id, first)))
+
+    robot.handle = hang  # type: ignore[method-assign]
+    assert outcome(anna.post(f"/devices/{robot.device}/stop")) == (202, "sent")
 
 
 @pytest.fixture
@@ -74,12 +96,12 @@ def two_rooms(cloud: Cloud) -> Iterator[TwoRooms]:
 def test_all_devices_of_a_space_are_stopped_and_no_others(two_rooms: TwoRooms) -> None:
     anna, first, second, lab = two_rooms
     answer = anna.post(f"/spaces/{first.space}/stop", {"reason": "smoke"})
-    assert (answer.status_code, confirmed(answer)) == (200, dict.fromkeys(first.devices, True))
+    assert (answer.status_code, outcomes(answer)) == (200, dict.fromkeys(first.devices, "confirmed"))
     assert sorted(command.device for command in first.received(StopDevice)) == ["left", "right"]
     assert {stop.reason for stop in first.stops} == {"smoke"}
     assert not second.commands
     assert not second.stops
-    assert confirmed(anna.post(f"/spaces/{lab}/stop")) == {second.device: True}
+    assert outcomes(anna.post(f"/spaces/{lab}/stop")) == {second.device: "confirmed"}
     problem(anna.post("/spaces/nowhere/stop"), 404, "space-unknown")
 
 
@@ -87,10 +109,13 @@ def test_all_devices_of_the_account_are_stopped_and_no_others(cloud: Cloud, two_
     anna, first, second, _ = two_rooms
     with paired(cloud, "bert") as (bert, other):
         answer = anna.post("/stop")
-        assert (answer.status_code, confirmed(answer)) == (200, dict.fromkeys([*first.devices, second.device], True))
+        assert (answer.status_code, outcomes(answer)) == (
+            200,
+            dict.fromkeys([*first.devices, second.device], "confirmed"),
+        )
         assert not other.commands
         assert not other.stops
-        assert confirmed(bert.post("/stop")) == {other.device: True}
+        assert outcomes(bert.post("/stop")) == {other.device: "confirmed"}
     assert cloud.sign_in("clara").post("/stop").json() == {"items": []}
 
 
@@ -102,7 +127,7 @@ def test_an_unresponsive_device_delays_no_other_and_is_named(two_rooms: TwoRooms
     assert len(first.received(StopDevice)) == 2
     answer = call()
     assert answer.status_code == 207
-    assert confirmed(answer) == {first.devices[0]: True, first.devices[1]: True, second.device: False}
+    assert outcomes(answer) == {**dict.fromkeys(first.devices, "confirmed"), second.device: "sent"}
     assert len(second.stops) >= 3, "repeated until the time limit"
     assert [anna.action(action)["status"] for action in waiting[1:]] == ["cancelled"] * 2
     events = anna.get(f"/devices/{second.device}/events").json()["items"]
@@ -114,5 +139,7 @@ def test_without_a_broker_each_device_is_reported(anna: Person, robot: Robot, br
     answer = anna.post("/stop")
     assert answer.status_code == 207
     (item,) = answer.json()["items"]
-    assert (item["device"], item["status"], item["confirmed"]) == (robot.device, 503, False)
+    assert (item["device"], item["status"], item["outcome"]) == (robot.device, 503, "unreachable")
     assert item["problem"]["type"] == "/problems/broker-unavailable"
+    answer = anna.post(f"/devices/{robot.device}/stop")
+    assert problem(answer, 503, "broker-unavailable")["outcome"] == "unreachable"
