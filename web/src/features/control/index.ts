@@ -1,4 +1,4 @@
 export { ControlBar } from "./control-bar";
 export { useDeviceSessions } from "./device-sessions";
 export { DevicePageFrame } from "./page-frame";
-export { StopBanner } from "./stop-button";
+export { StopBanner, StopOutcomes } from "./stop-button";

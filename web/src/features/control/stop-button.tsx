@@ -16,14 +16,33 @@ export function StopBanner({ device, stop }: StopBannerProps) {
     <div role="alert" class="alert-slot">
       {state.kind !== "clear" && (
         <div class="banner stopped" data-testid="stop-banner" data-state={state.kind}>
-          {state.kind === "sending" && <strong>{state.overdue ? texts.stop.overdue : texts.stop.sending}</strong>}
-          {state.kind === "unconfirmed" && <strong>{texts.stop.unconfirmed}</strong>}
-          {state.kind === "latched" && <Latched device={device} stop={stop} />}
+          {state.kind === "latched" ? (
+            <Latched device={device} stop={stop} />
+          ) : (
+            <div>
+              <strong>{texts.stop.outcomes[state.kind]}</strong>
+              {state.kind !== "sending" && <p>{state.repeating ? texts.stop.repeating : texts.stop.ended}</p>}
+            </div>
+          )}
           {error !== null && <p>{error}</p>}
         </div>
       )}
       {state.kind === "clear" && error !== null && <p class="notice bad">{error}</p>}
     </div>
+  );
+}
+
+/** The outcome for each stopped robot, below a button that stops several. */
+export function StopOutcomes({ sessions }: { sessions: readonly { device: DeviceStore; stop: StopSwitch }[] }) {
+  const stopped = sessions.filter(({ stop }) => stop.state.value.kind !== "clear");
+  return (
+    <ul class="stop-outcomes" role="status" data-testid="stop-outcomes">
+      {stopped.map(({ device, stop }) => (
+        <li key={device.id} data-device={device.id} data-state={stop.state.value.kind}>
+          <strong>{device.info.value.label}</strong>: {texts.stop.outcomes[stop.state.value.kind]}
+        </li>
+      ))}
+    </ul>
   );
 }
 
@@ -34,7 +53,7 @@ function Latched({ device, stop }: StopBannerProps) {
   return (
     <>
       <div>
-        <strong class="big">{texts.stop.latched}</strong>{" "}
+        <strong class="big">{texts.stop.outcomes.latched}</strong>{" "}
         {latch !== undefined && latch !== null && texts.stop.by(latch.caller, latch.reason)}
         <p>{texts.stop.explain}</p>
       </div>

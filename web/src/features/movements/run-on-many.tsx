@@ -2,7 +2,7 @@
 import type { Account } from "../../shared/api/types";
 import { RunSteps } from "../actions";
 import { ended } from "../actions/model";
-import { StopBanner } from "../control";
+import { StopBanner, StopOutcomes } from "../control";
 import { actionUnavailableReason, ReachChip } from "../devices";
 import type { DeviceSession } from "../control/model";
 import type { DeviceStore, Fleet } from "../devices/model";
@@ -57,6 +57,7 @@ export function RunOnManyBar({ sessions }: { sessions: readonly DeviceSession[] 
       >
         {sessions.length === 1 ? texts.many.stop : texts.many.stopAll} <kbd>{texts.many.stopKey}</kbd>
       </button>
+      <StopOutcomes sessions={sessions} />
     </div>
   );
 }

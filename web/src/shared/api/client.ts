@@ -272,7 +272,7 @@ export class Api {
     return this.#http.call("POST", `/actions/${id}/cancel`);
   }
 
-  stop(device: string, reason: string): Promise<{ confirmed: boolean }> {
+  stop(device: string, reason: string): Promise<{ outcome: "confirmed" | "sent" | "unreachable" }> {
     return this.#http.call("POST", `/devices/${device}/stop`, { body: { reason }, keepalive: true });
   }
 

@@ -99,8 +99,8 @@ describe("calls", () => {
     await session.start(null);
     let csrf = "of-another-session";
     server.on("GET /accounts/me", () => ok({ id: "demo", name: "Demo", session: "s2", csrf_token: csrf }));
-    server.on(`POST ${STOP}`, ({ headers }) => (headers["X-CSRF-Token"] === "of-another-session" ? ok({ confirmed: false }) : problem(403, "csrf-token", "No.")));
-    expect((await server.api.stop(DEVICE, "test")).confirmed).toBe(false);
+    server.on(`POST ${STOP}`, ({ headers }) => (headers["X-CSRF-Token"] === "of-another-session" ? ok({ outcome: "sent" }) : problem(403, "csrf-token", "No.")));
+    expect((await server.api.stop(DEVICE, "test")).outcome).toBe("sent");
     expect(server.callsTo(`POST ${STOP}`).map(({ headers }) => headers["X-CSRF-Token"])).toEqual([CSRF, csrf]);
     expect(server.callsTo("GET /accounts/me")[0]?.headers).not.toHaveProperty("X-CSRF-Token");
     csrf = "wrong";

@@ -7,7 +7,7 @@ import { StopSwitch } from "../../../src/features/control/model/stop";
 import { deliver, device, ends, link, pass, server } from "../../support/console";
 import { FakeLink } from "../../support/fake-link";
 import { ok, problem, unreachable } from "../../support/fake-server";
-import { DEVICE, TOPIC, description, listed, telemetry } from "../../support/messages";
+import { DEVICE, TOPIC, description, listed, state, telemetry } from "../../support/messages";
 
 const LEASE = `/devices/${DEVICE}/lease`;
 const STOP = `/devices/${DEVICE}/stop`;
@@ -31,18 +31,18 @@ describe("stop", () => {
   const stops = (): object[] => link.published.filter(({ topic }) => topic === `${TOPIC}/stop/account1`).map(({ message }) => message);
 
   beforeEach(() => {
-    server.on(`POST ${STOP}`, ok({ confirmed: false }));
+    server.on(`POST ${STOP}`, ok({ outcome: "sent" }));
     stop = new StopSwitch(server.api, device, link, "account1");
     ends.push(() => stop.dispose());
   });
 
   it("is sent over MQTT and HTTP, and republished with a warning until the robot confirms it", async () => {
     stop.press("test");
-    expect(stop.state.value).toEqual({ kind: "sending", overdue: false });
+    expect(stop.state.value).toEqual({ kind: "sending", repeating: true });
     expect(stops()).toMatchObject([{ reason: "test" }]);
     expect(server.callsTo(`POST ${STOP}`)).toHaveLength(1);
     await pass(1_500);
-    expect(stop.state.value).toEqual({ kind: "sending", overdue: true });
+    expect(stop.state.value).toEqual({ kind: "sent", repeating: true });
     expect(stops().length).toBeGreaterThan(4);
     latched();
     await pass(0);
@@ -54,7 +54,7 @@ describe("stop", () => {
 
   it("reaches the cloud while the broker is offline, until the robot's own report arrives", async () => {
     link.set("down");
-    server.on(`POST ${STOP}`, ok({ confirmed: true }));
+    server.on(`POST ${STOP}`, ok({ outcome: "confirmed" }));
     stop.press();
     await pass(100);
     expect(stop.state.value.kind).toBe("latched");
@@ -63,6 +63,30 @@ describe("stop", () => {
     deliver("tele/joints", telemetry());
     await pass(0);
     expect(stop.state.value.kind).toBe("clear");
+  });
+
+  it.each([
+    [ok({ outcome: "unreachable" }), "unreachable"],
+    [problem(503, "broker-unavailable", "No broker."), "unreachable"],
+    [ok({ outcome: "sent" }), "sent"],
+  ])("shows the outcome, also after it is no longer sent (%#)", async (answer, kind) => {
+    server.on(`POST ${STOP}`, answer);
+    stop.press();
+    await pass(1_500);
+    expect(stop.state.value).toEqual({ kind, repeating: true });
+    await pass(60_000);
+    expect(stop.state.value).toEqual({ kind, repeating: false });
+    latched();
+    await pass(0);
+    expect(stop.state.value.kind).toBe("latched");
+  });
+
+  it("of another operator is not shown as applied while the control loop has not applied it", () => {
+    const latch = { caller: "Bob", reason: "", at_ms: 1 };
+    deliver("state", state(0, null, { mode: "idle", stop: latch }));
+    expect(stop.state.value.kind).toBe("sent");
+    deliver("state", state(0, null, { mode: "fault", stop: latch }));
+    expect(stop.state.value.kind).toBe("latched");
   });
 
   it("is not sent for a viewer, and the page shows why", () => {

@@ -15,18 +15,24 @@ const CONFIRM_TIMEOUT_MS = 1_000;
 /** Stop is republished for at most this long; after it, an operator must be at the robot [ms]. */
 const REPEAT_FOR_MS = 60_000;
 
-type StopState =
-  | { kind: "clear" }
-  /** Sent and not confirmed; `overdue` after `CONFIRM_TIMEOUT_MS`. */
-  | { kind: "sending"; overdue: boolean }
-  | { kind: "latched" }
-  | { kind: "unconfirmed" };
+/**
+ * `sending`: sent less than `CONFIRM_TIMEOUT_MS` ago. `sent`: not confirmed. `unreachable`: the agent is offline, or no
+ * channel could send it. `latched`: the control loop of the robot has applied it.
+ */
+export type StopKind = "clear" | "sending" | "sent" | "unreachable" | "latched";
 
-type Pressed =
-  | { kind: "sending"; at: number; overdue: boolean }
-  /** The robot confirmed to the cloud that it stopped; this page has not received the state yet. */
-  | { kind: "confirmed"; at: number }
-  | { kind: "unconfirmed" };
+interface StopState {
+  kind: StopKind;
+  /** Whether Stop is still republished. */
+  repeating: boolean;
+}
+
+interface Pressed {
+  /** `latched`: the robot confirmed to the cloud; this page has not received the state yet. */
+  kind: Exclude<StopKind, "clear">;
+  at: number;
+  repeating: boolean;
+}
 
 export class StopSwitch {
   readonly #api: Api;
@@ -46,9 +52,9 @@ export class StopSwitch {
 
   readonly state = computed<StopState>(() => {
     const pressed = this.#pressed.value;
-    if (pressed?.kind === "sending") return { kind: "sending", overdue: pressed.overdue };
-    if (this.#device.stopped.value || pressed?.kind === "confirmed") return { kind: "latched" };
-    return pressed === null ? { kind: "clear" } : { kind: "unconfirmed" };
+    if (pressed?.repeating === true) return { kind: pressed.kind, repeating: true };
+    if (this.#device.stopped.value) return { kind: "latched", repeating: false };
+    return { kind: pressed?.kind ?? (this.#device.stopPending.value ? "sent" : "clear"), repeating: false };
   });
 
   constructor(api: Api, device: DeviceStore, link: Link, author: string) {
@@ -60,10 +66,10 @@ export class StopSwitch {
       const latest = device.telemetry.value;
       const pressed = this.#pressed.value;
       // The robot's own state takes precedence once it arrives.
-      if (pressed?.kind === "confirmed" && latest !== null && latest.receivedAt > pressed.at + CONFIRM_TIMEOUT_MS) {
+      if (pressed?.kind === "latched" && latest !== null && latest.receivedAt > pressed.at + CONFIRM_TIMEOUT_MS) {
         queueMicrotask(() => this.#finish(null));
       }
-      if (pressed?.kind !== "sending") return;
+      if (pressed?.repeating !== true) return;
       // Only messages after the press confirm it. `state` has no arrival time: any change of it is new.
       const telemetryStopped = latest !== null && latest.receivedAt >= pressed.at && latest.message.mode === "stopped";
       const stateStopped = device.state.value !== this.#stateAtPress && device.state.value?.mode === "stopped";
@@ -82,25 +88,25 @@ export class StopSwitch {
     this.#stateAtPress = this.#device.state.value;
     const at = now();
     this.#error.value = null;
-    this.#pressed.value = { kind: "sending", at, overdue: false };
+    this.#pressed.value = { kind: "sending", at, repeating: true };
     const message: Stop = { id: newId(), reason };
     clearInterval(this.#timer);
     this.#timer = setInterval(() => {
       const age = now() - at;
       if (age > REPEAT_FOR_MS) {
-        this.#finish({ kind: "unconfirmed" });
+        this.#finish({ kind: this.#unconfirmed(), at, repeating: false });
         return;
       }
-      if (age > CONFIRM_TIMEOUT_MS) this.#pressed.value = { kind: "sending", at, overdue: true };
+      if (age > CONFIRM_TIMEOUT_MS) this.#report(this.#unconfirmed(), at);
       this.#publish(message);
     }, REPEAT_MS);
     this.#publish(message);
     this.#api.stop(this.#device.id, reason).then(
-      ({ confirmed }) => {
-        const pressed = this.#pressed.value;
-        if (confirmed && pressed?.kind === "sending" && pressed.at === at) this.#finish({ kind: "confirmed", at: now() });
+      ({ outcome }) => this.#report(outcome === "confirmed" ? "latched" : outcome, at),
+      (error: unknown) => {
+        this.#error.value = sentence(error);
+        this.#report("unreachable", at);
       },
-      (error: unknown) => (this.#error.value = sentence(error)),
     );
   }
 
@@ -122,6 +128,20 @@ export class StopSwitch {
   dispose(): void {
     clearInterval(this.#timer);
     this.#disposeEffect();
+  }
+
+  /** Without a confirmation: whether the Stop was sent, as far as this page knows. */
+  #unconfirmed(): "sent" | "unreachable" {
+    const unreachable = this.#pressed.value?.kind === "unreachable" || this.#device.reach.value === "offline";
+    return unreachable ? "unreachable" : "sent";
+  }
+
+  /** Displays the outcome of the press at `at`, while it is the current one. */
+  #report(kind: Pressed["kind"], at: number): void {
+    const pressed = this.#pressed.value;
+    if (pressed?.at !== at || !pressed.repeating) return;
+    if (kind === "latched") this.#finish({ kind, at: now(), repeating: false });
+    else this.#pressed.value = { ...pressed, kind };
   }
 
   #publish(message: Stop): void {

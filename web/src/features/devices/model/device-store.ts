@@ -116,6 +116,15 @@ export class DeviceStore {
     return lastSeenAt === null || clock.value - lastSeenAt > LIST_STALE_MS ? "stale" : "online";
   });
 
+  readonly #stop = computed(() => {
+    const latest = this.#telemetry.value?.message;
+    const state = this.#state.value;
+    const newest = latest !== undefined && (state === null || latest.tick_ms >= state.tick_ms) ? latest : state;
+    if (newest?.mode === "stopped") return "applied";
+    if (state === null || newest !== state || (state.stop ?? null) === null) return "none";
+    return state.mode === "fault" ? "applied" : "pending";
+  });
+
   /** Whether the displayed state is current. */
   readonly live = computed(() => this.reach.value === "online");
 
@@ -125,13 +134,11 @@ export class DeviceStore {
   /** Active restrictions of its motion, as the device reports them. */
   readonly limited = computed(() => this.#telemetry.value?.message.limited.join(", ") ?? "");
 
-  /** Whether Stop is latched, according to the device's newest message. */
-  readonly stopped = computed(() => {
-    const latest = this.#telemetry.value?.message;
-    const state = this.#state.value;
-    const newest = latest !== undefined && (state === null || latest.tick_ms >= state.tick_ms) ? latest : state;
-    return newest?.mode === "stopped" || (state?.stop ?? null) !== null && newest === state;
-  });
+  /** Whether the control loop has applied Stop, or a faulty device has latched it, according to the newest message. */
+  readonly stopped = computed(() => this.#stop.value === "applied");
+
+  /** Whether Stop is latched, but the control loop has not applied it. */
+  readonly stopPending = computed(() => this.#stop.value === "pending");
 
   /**
    * The lease holder; `null`: none. The device enforces the lease that it has received, so its report takes precedence over the

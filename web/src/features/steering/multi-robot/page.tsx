@@ -1,6 +1,6 @@
 /** Several robots on one page, each with its own control; one key and one button stop them all. */
 import type { Account } from "../../../shared/api/types";
-import { ControlBar, StopBanner, useDeviceSessions } from "../../control";
+import { ControlBar, StopBanner, StopOutcomes, useDeviceSessions } from "../../control";
 import { LastSeenAge, ReachChip } from "../../devices";
 import type { DeviceSession } from "../../control/model";
 import type { DeviceStore, Fleet } from "../../devices/model";
@@ -50,6 +50,7 @@ export function MultiRobotPage({ api, fleet, ids: idList, account }: MultiRobotP
         >
           {texts.multiRobot.stopAll} <kbd>{texts.multiRobot.stopKey}</kbd>
         </button>
+        <StopOutcomes sessions={sessions} />
       </div>
       <main class="page operate together" id="content">
         <div class="heading">
