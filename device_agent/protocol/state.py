@@ -95,11 +95,16 @@ class ActionState(Struct, frozen=True, kw_only=True):
 
 
 class Fault(Struct, frozen=True, kw_only=True):
-    """A fault that persists."""
+    """A fault, until its condition has been absent for half a minute.
+
+    ``count``: how often the condition has occurred since ``since_ms``; ``last_ms``: when it was last present.
+    """
 
     code: Label
     message: Text
     since_ms: Milliseconds
+    count: Count = 1
+    last_ms: Milliseconds = 0
 
 
 class Restriction(Struct, frozen=True, kw_only=True):

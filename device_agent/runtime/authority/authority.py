@@ -117,16 +117,12 @@ class Authority:
 
     def set_fault(self, message: str) -> None:
         """Record that the driver failed, and hold."""
-        if self.fault != message:
-            self.record(EventKind.DRIVER_FAILED, message, {}, "error")
         self.fault = message
         self.end(Refused("fault", message))
 
     def clear_fault(self) -> bool:
         """Record that the driver works again. Returns False if it had not failed."""
         failed, self.fault = self.fault is not None, None
-        if failed:
-            self.record(EventKind.DRIVER_RECOVERED, "the device responds again", {})
         return failed
 
     def end(self, why: Refused, lease: Lease | None = None) -> None:

@@ -38,6 +38,7 @@ from device_agent.protocol.security import signing
 from device_agent.runtime.actions.executor import ActionExecutor
 from device_agent.runtime.authority.control_request import PendingControlRequest
 from device_agent.runtime.authority.event_recorder import EventRecord, EventRecorder
+from device_agent.runtime.authority.fault_reporter import FaultReporter
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
@@ -48,6 +49,10 @@ from device_agent.runtime.telemetry.device_publisher import DevicePublisher, Sta
 _FUTURE_MS = 2000
 """Tolerance for commands issued in the future; larger than the error of the clock estimate [ms]."""
 _MAX_WAITING = 1000
+FAULT_STABLE_S = 30.0
+"""A fault is cleared when its condition has been absent for this long [s]."""
+_DRIVER = "driver"
+"""Code of the driver's error."""
 _IDLE_S, _CONFIRM_S = 0.1, 0.01
 """Time between two checks of state and events, and of a Stop that the control loop has not applied yet [s]."""
 _log = logging.getLogger(__name__)
@@ -84,6 +89,7 @@ class CommandProcessor:
         self._load = load
         self._device_faults = device_faults
         self._control_request = PendingControlRequest()
+        self._fault_reporter = FaultReporter(stable_s=FAULT_STABLE_S)
         self._pending_stops: dict[str, int] = {}
         self._twin: Twin | None = None
         self._commands: queue.Queue[bytes] = queue.Queue(maxsize=_MAX_WAITING)
@@ -292,11 +298,20 @@ class CommandProcessor:
                 raise
 
     def _faults(self) -> tuple[Fault, ...]:
-        """The driver's error, or else the faults that the driver does not raise."""
-        fault = self._controller.fault
-        if fault is not None:
-            return (Fault(code="driver", message=fault[:2000], since_ms=wall_ms()),)
-        return self._device_faults()
+        """Open faults: the driver's error, or else those that the driver does not raise. One event for each change."""
+        error = self._controller.fault
+        present = self._device_faults()
+        if error is not None:
+            present = (Fault(code=_DRIVER, message=error[:2000], since_ms=wall_ms()),)
+        changes = self._fault_reporter.update(present)
+        for fault in changes.raised:
+            if fault.code == _DRIVER:
+                self._events.record(EventRecord(EventKind.DRIVER_FAILED, fault.message, "error"))
+        for fault in changes.cleared:
+            if fault.code == _DRIVER:
+                data = {"count": fault.count}
+                self._events.record(EventRecord(EventKind.DRIVER_RECOVERED, "the device responds again", data=data))
+        return self._fault_reporter.faults
 
     def _snapshot(self) -> StateSnapshot:
         now_s = time.monotonic()

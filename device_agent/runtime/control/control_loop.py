@@ -70,7 +70,7 @@ class ControlLoop:
         self._rounded: tuple[Observation, Observation] | None = None
         self._next_s = 0.0
         self._ran_early = False
-        self._error = ""
+        self._error = self._logged = ""
         self._runs_inline = isinstance(driver, RunsInline) and driver.prompt
         self._requested = threading.Event()
         self._period_lock = threading.Lock()
@@ -170,8 +170,10 @@ class ControlLoop:
         except DriverError as error:
             self._error = str(error)
         except Exception as error:  # noqa: BLE001 (any error holds the device until the driver responds)
-            _log.exception("%s: control loop", self._name)
             self._error = f"internal error: {error}"
+            if self._error != self._logged:
+                _log.exception("%s: control loop", self._name)
+            self._logged = self._error
         if self._error:
             self._requested.set()  # wakes the loop's thread, which handles the fault
         self._ran_early = early
@@ -184,7 +186,6 @@ class ControlLoop:
         return min(max(now_s - (self._next_s - self._period_s), _MIN_ELAPSED_S), self._period_s)
 
     def _handle_fault(self) -> None:
-        _log.error("%s: %s", self._name, self._error)
         self._controller.set_fault(self._error)
         self._controller.record_period(self._controller.update(time.monotonic()))
         while not self._stopping.wait(_RECONNECT_PERIOD_S):

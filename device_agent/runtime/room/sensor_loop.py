@@ -64,6 +64,7 @@ class SensorLoop:
         self._sources = [_Source(stream, is_camera=False) for stream in room_device.streams]
         self._sources += [_Source(camera, is_camera=True) for camera in room_device.cameras]
         self._held = False
+        self._logged = ""
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"{name}-sensing", daemon=True)
         self.observation: Observation | None = None
@@ -107,8 +108,11 @@ class SensorLoop:
             except SensorError as error:
                 self._set_fault(str(error))
             except Exception as error:  # noqa: BLE001 (any error is reported as a fault)
-                _log.exception("%s: sensing", self._name)
-                self._set_fault(f"internal error: {error}")
+                message = f"internal error: {error}"
+                if message != self._logged:
+                    _log.exception("%s: sensing", self._name)
+                self._logged = message
+                self._set_fault(message)
             self._pause()
 
     def _pause(self) -> None:
@@ -164,7 +168,6 @@ class SensorLoop:
             raise SensorError(f"{source.name}: {error}; configure smaller pictures") from error
 
     def _set_fault(self, message: str) -> None:
-        _log.error("%s: %s", self._name, message)
         self._controller.set_fault(message)
         with contextlib.suppress(SensorError):
             self._apply(self._controller.update(time.monotonic()))

@@ -38,6 +38,7 @@ class Report:
         kind: Detector: ``level``, ``trend``, ``change``, ``outlier``; or ``reported``, ``silent``.
         message: Description of the fault, and an instruction.
         value: Measured value; ``baseline``: usual value; ``limit``: allowed limit.
+        occurrences: How often the condition has occurred since the device raised the fault.
     """
 
     code: str
@@ -50,6 +51,7 @@ class Report:
     value: float | None = None
     baseline: float | None = None
     limit: float | None = None
+    occurrences: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +62,8 @@ class Fault:
         id: Decreases with time, so that the newest fault sorts first.
         count: Number of this fault among the faults with the same code.
         worse: How often the severity increased.
+        occurrences: How often its condition has come and gone while the fault was open.
+        last_seen_ms: When its condition last occurred.
     """
 
     id: str
@@ -79,6 +83,8 @@ class Fault:
     acknowledged_ms: int | None = None
     acknowledged_by: str = ""
     cleared_ms: int | None = None
+    occurrences: int = 1
+    last_seen_ms: int | None = None
 
 
 def raised(report: Report, *, fault: str, now_ms: int, count: int) -> Fault:
@@ -97,11 +103,18 @@ def raised(report: Report, *, fault: str, now_ms: int, count: int) -> Fault:
         value=report.value,
         baseline=report.baseline,
         limit=report.limit,
+        occurrences=report.occurrences,
+        last_seen_ms=now_ms,
     )
 
 
-def reported(fault: Fault, report: Report) -> Fault:
-    """The fault after another report; a higher severity removes the acknowledgement, else it is the same object."""
+def reported(fault: Fault, report: Report, *, now_ms: int) -> Fault:
+    """The fault after another report: the same object, or with more occurrences or a higher severity.
+
+    A higher severity removes the acknowledgement.
+    """
+    if report.occurrences > fault.occurrences:
+        fault = replace(fault, occurrences=report.occurrences, last_seen_ms=now_ms)
     if report.severity.rank <= fault.severity.rank:
         return fault
     return replace(

@@ -104,16 +104,20 @@ class Faults:
         return list(page.rows)
 
     async def _report(self, device: Device, key: str, report: Report, row: Row | None) -> bool:
-        """Raise a fault or increase its severity; return whether it changed."""
-        partition = _partition(device)
+        """Raise a fault, count its occurrences or increase its severity; return whether there is an event."""
+        partition, now_ms = _partition(device), self._clock.now_ms()
         if row is not None:
             existing = records.read(row, Fault)
-            worsened = rules.reported(existing, report)
-            if worsened is not existing:
-                write = Write("replace", row.changed(records.to_data(worsened)))
-                await self._write(device, worsened, f"worsened-{worsened.worse}", [write])
-            return worsened is not existing
-        now_ms = self._clock.now_ms()
+            after = rules.reported(existing, report, now_ms=now_ms)
+            if after is existing:
+                return False
+            write = Write("replace", row.changed(records.to_data(after)))
+            worsened = after.worse > existing.worse
+            if worsened:
+                await self._write(device, after, f"worsened-{after.worse}", [write])
+            else:  # a further occurrence of the same condition: no event
+                await self._tables.batch(records.FAULTS, [write])
+            return worsened
         count_key = _COUNT + key.removeprefix(_OPEN)
         counted = await self._tables.get(records.FAULTS, partition, count_key)
         count = counted.data["count"] + 1 if counted else 1

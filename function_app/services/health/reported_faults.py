@@ -10,7 +10,7 @@ import hashlib
 
 import msgspec
 
-from device_agent.protocol import State
+from device_agent.protocol import Fault, State
 from function_app.domain.devices.devices import SILENT_MS, Agent, Device, LastState, Link
 from function_app.domain.health.faults import Report, Severity, Source
 from function_app.ports.clock import Clock
@@ -52,7 +52,7 @@ class ReportedFaults:
             await self._schedule_check(agent.id, now_ms)
             await self._faults.settle(device, _CLOUD, [])
         if existing is None or state.faults or existing.state.get("faults"):
-            await self._faults.settle(device, _DEVICE, [_reported(fault.code, fault.message) for fault in state.faults])
+            await self._faults.settle(device, _DEVICE, [_reported(fault) for fault in state.faults])
 
     async def check_silent(self, now_ms: int) -> None:
         """Check the agents that are due. Idempotent and safe to run concurrently. Raises ``busy``."""
@@ -106,9 +106,15 @@ class ReportedFaults:
         await records.retry(attempt)
 
 
-def _reported(code: str, message: str) -> Report:
-    text = message or f"The device reports '{code}'. Check the device."
-    return Report(code=code, source=Source.DEVICE, kind="reported", severity=Severity.ERROR, message=text)
+def _reported(fault: Fault) -> Report:
+    return Report(
+        code=fault.code,
+        source=Source.DEVICE,
+        kind="reported",
+        severity=Severity.ERROR,
+        message=fault.message or f"The device reports '{fault.code}'. Check the device.",
+        occurrences=fault.count,
+    )
 
 
 def _silent(device: Device) -> Report:

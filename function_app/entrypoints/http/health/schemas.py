@@ -11,7 +11,8 @@ class FaultOut(Response, frozen=True, kw_only=True):
     ``kind``: ``reported`` by the device, ``silent`` (no messages from it), or the detector: ``level`` (beyond a limit),
     ``trend`` (moving towards a limit), ``change`` (lasting shift), ``outlier`` (far from the baseline). ``count``:
     number of this fault among those with the same code. ``worsened``: how often its severity increased, which each
-    time removes the acknowledgement.
+    time removes the acknowledgement. ``occurrences``: how often its condition has come and gone while it was open;
+    ``last_seen_at``: the newest occurrence.
     """
 
     id: str
@@ -32,6 +33,8 @@ class FaultOut(Response, frozen=True, kw_only=True):
     cleared_at: Moment | None
     count: int
     worsened: int
+    occurrences: int
+    last_seen_at: Moment | None
 
 
 class FaultList(Response, frozen=True, kw_only=True):

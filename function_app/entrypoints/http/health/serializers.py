@@ -18,4 +18,5 @@ def fault_out(fault: Fault) -> FaultOut:
         acknowledged_at=None if fault.acknowledged_ms is None else rfc3339(fault.acknowledged_ms),
         cleared_at=None if fault.cleared_ms is None else rfc3339(fault.cleared_ms),
         worsened=fault.worse,
+        last_seen_at=None if fault.last_seen_ms is None else rfc3339(fault.last_seen_ms),
     )

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from device_agent.runtime.commands import command_processor
 from device_agent.runtime.control import control_loop
 from device_agent.runtime.room import sensor_loop
 from device_agent.runtime.telemetry import device_publisher
@@ -16,11 +17,12 @@ MakeDevice = Callable[..., DeviceHarness]
 
 @pytest.fixture(autouse=True)
 def short_periods(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorten the periods of reconnections and states."""
+    """Shorten the periods of reconnections, states and faults."""
     for module, name in (
         (control_loop, "_RECONNECT_PERIOD_S"),
         (sensor_loop, "_RECONNECT_PERIOD_S"),
         (device_publisher, "STATE_MIN_GAP_S"),
+        (command_processor, "FAULT_STABLE_S"),
     ):
         monkeypatch.setattr(module, name, 0.05)
 

@@ -97,7 +97,7 @@ function FaultHistory({ fault }: { fault: Fault }) {
         </li>
       </ol>
       <p class="quiet small">
-        {[labels.source[fault.source], labels.count(fault.count), labels.worsened(fault.worsened)].filter((one) => one !== "").join(" · ")}
+        {[labels.source[fault.source], labels.count(fault.count), labels.worsened(fault.worsened), labels.recurred(fault.occurrences, fault.last_seen_at)].filter((one) => one !== "").join(" · ")}
       </p>
     </>
   );

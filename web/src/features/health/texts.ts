@@ -56,6 +56,8 @@ export const texts = {
         detector: "detected by the server in the device's measurements",
         cloud: "detected by the server: no data from the device",
       } satisfies Record<Fault["source"], string>,
+      recurred: (occurrences: number, lastSeenAt: string | null): string =>
+        occurrences === 1 || lastSeenAt === null ? "" : `condition seen ${occurrences} times, last ${format.dateTime(lastSeenAt)}`,
       count: (count: number): string => (count === 1 ? "first occurrence" : `${count} occurrences`),
       worsened: (times: number): string => (times === 0 ? "" : times === 1 ? "worsened once" : `worsened ${times} times`),
     },

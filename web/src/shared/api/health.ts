@@ -28,6 +28,9 @@ export interface Fault {
   /** Occurrence number for its code. */
   count: number;
   worsened: number;
+  /** How often its condition has come and gone while the fault was open; the newest time is `last_seen_at`. */
+  occurrences: number;
+  last_seen_at: string | null;
 }
 
 /** One monitored field, averaged over ten seconds. */

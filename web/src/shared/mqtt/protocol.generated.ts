@@ -335,12 +335,18 @@ export interface ActionState {
   progress?: number;
 }
 
-/** A fault that persists. */
+/**
+ * A fault, until its condition has been absent for half a minute.
+ *
+ * `count`: how often the condition has occurred since `since_ms`; `last_ms`: when it was last present.
+ */
 export interface Fault {
   /** no control and format characters */
   code: string;
   message: string;
   since_ms: number;
+  count?: number;
+  last_ms?: number;
 }
 
 /** A speed restriction of the room, set by the interlock `source`. `speed` is the remaining share; 0: hold. */

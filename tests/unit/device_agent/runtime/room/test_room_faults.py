@@ -2,9 +2,14 @@
 
 from unittest import mock
 
+import pytest
+
 from device_agent.config.interlock_rule import InterlockRule
+from device_agent.ports.sensor import SensorError
 from device_agent.protocol import CollectData, Mode, ResetStop, SetControl, StopDevice, TakePicture
 from device_agent.protocol.codec import MAX_BYTES
+from device_agent.protocol.events import EventKind
+from device_agent.runtime.commands import command_processor
 from tests.harness.agent.device_harness import eventually, wait_for_state
 from tests.unit.device_agent.runtime.room.conftest import MakeRoomDevice
 from tests.unit.device_agent.runtime.room.room_device_fixture import RoomDeviceHarness, await_growth
@@ -42,6 +47,26 @@ def test_a_sensor_error_is_a_fault_until_the_sensor_responds(make_room_device: M
     harness.sensor.broken = ""
     wait_for_state(harness, lambda state: not state.faults)
     harness.done(TakePicture())
+
+
+def test_a_sensor_that_fails_after_each_reconnection_is_one_fault_event_and_log_line(
+    make_room_device: MakeRoomDevice, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(command_processor, "FAULT_STABLE_S", 1000.0)
+    harness = make_room_device()
+    reconnections = []
+
+    def fail(_: str) -> None:
+        reconnections.append(harness.sensor.closed)
+        raise SensorError("no answer on the bus")
+
+    with mock.patch.object(harness.sensor, "read", fail):
+        fault = wait_for_state(harness, lambda state: state.faults).faults[0]
+        eventually(lambda: len(reconnections) >= 5)
+    assert (fault.code, fault.message) == ("driver", "no answer on the bus")
+    assert len(harness.events(EventKind.DRIVER_FAILED)) == 1
+    assert harness.events(EventKind.DRIVER_RECOVERED) == []
+    assert len([record for record in caplog.records if "no answer" in record.getMessage()]) == 1
 
 
 def test_an_unexpected_driver_error_is_a_fault_and_the_loop_continues(harness: RoomDeviceHarness) -> None:

@@ -4,6 +4,8 @@ import contextlib
 import itertools
 from typing import Any
 
+import msgspec
+
 from device_agent.protocol import Fault, Mode, State
 from function_app.domain.devices.devices import SILENT_MS, Device
 from function_app.domain.health.faults import Report, Severity, Source
@@ -69,6 +71,19 @@ def test_a_reported_fault_is_raised_acknowledged_and_cleared(cloud: Cloud, anna:
     (again,) = faults(anna, robot, open=True)
     assert (again["count"], again["state"]) == (2, "raised")
     assert [item["count"] for item in faults(anna, robot)] == [2, 1]
+
+
+def test_further_occurrences_are_counted_in_the_open_fault_without_events(
+    cloud: Cloud, anna: Person, robot: Robot
+) -> None:
+    for count in range(1, 6):
+        cloud.clock.advance(30)
+        flapping = Fault(code="silent.camera", message="No image. Check it.", since_ms=1, count=count)
+        robot.publish_state(msgspec.structs.replace(state(cloud), faults=(flapping,)))
+    (fault,) = faults(anna, robot)
+    assert (fault["count"], fault["occurrences"], fault["state"]) == (1, 5, "raised")
+    assert fault["last_seen_at"] > fault["raised_at"]
+    assert events(anna, robot) == ["fault-raised"]
 
 
 def test_a_worsened_fault_must_be_acknowledged_again(cloud: Cloud, anna: Person, robot: Robot) -> None:

@@ -9,6 +9,7 @@ import pytest
 from device_agent.protocol import Description, Measurements, Mode, State, codec, topics
 from device_agent.protocol.manifests import room
 from device_agent.protocol.manifests.room import RoomDeviceManifest, Watch
+from device_agent.runtime.commands import command_processor
 from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.sensors.mujoco import scalar_sensors
 from device_agent.simulation.room.climate import Climate
@@ -111,8 +112,9 @@ def test_people_in_a_closed_room_raise_a_co2_fault_that_an_open_door_clears(
 
 
 @pytest.fixture
-def meter(tmp_path: Path) -> Iterator[DeviceHarness]:
+def meter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DeviceHarness]:
     """The CO₂ meter of the laboratory, with a higher rate and shorter time limits."""
+    monkeypatch.setattr(command_processor, "FAULT_STABLE_S", 0.05)
     world = ManualWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
     entry = world.entry("co2")
     (stream,) = entry.streams
