@@ -21,6 +21,7 @@ from function_app.domain.health.estimators import (
     page_hinkley,
     theil_sen,
 )
+from function_app.domain.health.forecast import SHORT, Interval, forecast
 
 WINDOW_MS = 10_000
 MINUTE_MS = 60_000
@@ -86,8 +87,6 @@ SLOWING = 0.9
 """A slope below this share of the previous slope is decaying."""
 PROVEN = 0.75
 """A trend is proven if the previous slope was at least this share of the current one."""
-SOON = 1 / 4
-"""Share of the horizon for a new trend, which may be a warm-up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,10 +139,12 @@ class DetectorState:
     Attributes:
         seen_ms: Start of the newest window [ms since 1970].
         value: Mean of that window.
-        minutes: Means of the newest whole minutes.
+        recent: Time [ms] and mean of the newest windows.
+        minutes: Means of the newest whole minutes, without gaps.
         minute: Sum and count of the windows of the current minute.
         slope_per_s: Slope [unit/s].
-        limit_in_s: Time until a limit is reached [s].
+        limit_in_s: Expected time until a limit is reached [s]; only for the detector.
+        forecast: 90 % prediction interval of that time; ``None``: uncertain, or no limit is approached.
         level: Beyond a warning; ``breach``: beyond a limit.
         settled_at: Value before the current change.
     """
@@ -152,10 +153,12 @@ class DetectorState:
     value: float = 0.0
     baseline: Baseline = field(default_factory=Baseline)
     hinkley: PageHinkley = field(default_factory=PageHinkley)
+    recent: tuple[tuple[int, float], ...] = ()
     minutes: tuple[float, ...] = ()
     minute: tuple[float, int] = (0.0, 0)
     slope_per_s: float | None = None
     limit_in_s: float | None = None
+    forecast: Interval | None = None
     level: Streak = field(default_factory=Streak)
     breach: Streak = field(default_factory=Streak)
     trend: Streak = field(default_factory=Streak)
@@ -212,6 +215,7 @@ def update(previous: DetectorState, limits: Limits, at_ms: int, value: float) ->
         previous,
         seen_ms=at_ms,
         value=value,
+        recent=(*previous.recent, (at_ms, value))[-SHORT[-1] :],
         baseline=learn(previous.baseline, value, scale=spread, repeated=value == previous.value),
         level=_level(previous.level, limits.warning_low, limits.warning_high, limits, value),
         breach=_level(previous.breach, limits.low, limits.high, limits, value),
@@ -221,7 +225,7 @@ def update(previous: DetectorState, limits: Limits, at_ms: int, value: float) ->
         after = replace(after, level=Streak(), breach=Streak())
     if CHANGE in limits.kinds:
         after = _changed(after, limits, value, spread if warm else 0.0)
-    return _minute(previous, after, limits, at_ms, value)
+    return _forecast(_minute(previous, after, limits, at_ms, value), limits)
 
 
 def _after_gap(previous: DetectorState, at_ms: int) -> DetectorState:
@@ -229,7 +233,8 @@ def _after_gap(previous: DetectorState, at_ms: int) -> DetectorState:
         return previous
     if at_ms - previous.seen_ms > ABSENCE_MS:
         return DetectorState(level=previous.level, breach=previous.breach)
-    return replace(previous, minutes=(), minute=(0.0, 0), slope_per_s=None, limit_in_s=None, trend=Streak())
+    after = replace(previous, recent=(), minutes=(), minute=(0.0, 0), trend=Streak())
+    return replace(after, slope_per_s=None, limit_in_s=None, forecast=None)
 
 
 def _level(streak: Streak, low: float | None, high: float | None, limits: Limits, value: float) -> Streak:
@@ -266,19 +271,40 @@ def _changed(after: DetectorState, limits: Limits, value: float, spread: float) 
     return replace(after, hinkley=hinkley, change=change, settled_at=after.settled_at if change.on else None)
 
 
+SOON_S = 600.0
+"""A trend is reported at once if its forecast ends within this time [s]."""
+
+
+def _forecast(after: DetectorState, limits: Limits) -> DetectorState:
+    """Forecast the time to a limit, from the end of the newest window."""
+    if TREND not in limits.kinds or limits.lowest is limits.highest is None or len(after.recent) < SHORT[0]:
+        return replace(after, forecast=None)
+    now_ms = after.seen_ms + WINDOW_MS
+    recent = [((at_ms + WINDOW_MS / 2 - now_ms) / 1000, value) for at_ms, value in after.recent]
+    newest_ms = after.seen_ms // MINUTE_MS * MINUTE_MS - MINUTE_MS / 2 - now_ms
+    count = len(after.minutes)
+    minutes = [((newest_ms - (count - 1 - place) * MINUTE_MS) / 1000, mean) for place, mean in enumerate(after.minutes)]
+    result = forecast(recent, minutes, low=limits.lowest, high=limits.highest)
+    soon = result is not None and result.latest_s <= SOON_S
+    return replace(after, forecast=result, trend=Streak(on=True) if soon else after.trend)
+
+
 def _minute(previous: DetectorState, after: DetectorState, limits: Limits, at_ms: int, value: float) -> DetectorState:
     """Close a completed minute and update its trend."""
     total, count = previous.minute
     if not count or at_ms // MINUTE_MS == previous.seen_ms // MINUTE_MS:
         return replace(after, minute=(total + value, count + 1))
-    minutes = (*previous.minutes, total / count)[-2 * SPAN :]
+    mean = total / count
+    missing = at_ms // MINUTE_MS - previous.seen_ms // MINUTE_MS - 1
+    filled = tuple(mean + (value - mean) * (step + 1) / (missing + 1) for step in range(missing))
+    minutes = (*previous.minutes, mean, *filled)[-2 * SPAN :]
     after = replace(after, minutes=minutes, minute=(value, 1))
     if TREND not in limits.kinds:
         return after
     result = trend(minutes, limits)
     limit_in_s = None if result is None else result.limit_in_s
-    horizon_s = limits.horizon_s * (1.0 if result is None or result.proven else SOON)
-    near = limit_in_s is not None and limit_in_s <= horizon_s
+    # A new trend may be a warm-up: it is left to the forecast.
+    near = result is not None and result.proven and limit_in_s is not None and limit_in_s <= limits.horizon_s
     far = limit_in_s is None or limit_in_s > 1.5 * limits.horizon_s
     streak = after.trend.step(bad=near, good=far, after=3, until=5)
     return replace(after, slope_per_s=None if result is None else result.per_s, limit_in_s=limit_in_s, trend=streak)

@@ -1,13 +1,16 @@
 """Converts detector results to fault reports, and faults to a health status."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 from function_app.domain.health.detectors import CHANGE, LEVEL, NEAR, OUTLIER, TREND, DetectorState, Limits, scale
 from function_app.domain.health.faults import Fault, Report, Severity, Source
+from function_app.domain.health.forecast import Interval
 
 _FIVE_DIGITS = 10_000.0
+_LONG_S = 120.0
 
 
 class Health(StrEnum):
@@ -108,13 +111,21 @@ def _describe(kind: str, rule: Rule, name: str, watch: DetectorState, limit: flo
     if kind == TREND:
         slope = watch.slope_per_s or 0.0
         verb = "rises" if slope > 0 else "falls"
-        when = "now" if not watch.limit_in_s else f"in about {max(1, round(watch.limit_in_s / 60))} min"
         per_minute = _show(abs(slope) * 60, rule.unit)
         bound = _show(limit or 0.0, rule.unit)
-        return f"{what} is {value} and {verb} by {per_minute} per minute. It reaches {bound} {when}."
+        when = "" if watch.forecast is None else f" It reaches {bound} {_when(watch.forecast)}."
+        return f"{what} is {value} and {verb} by {per_minute} per minute towards {bound}.{when}"
     if kind == CHANGE:
         return f"{what} has changed to {value} from {_show(watch.settled_at or 0.0, rule.unit)}."
     return f"{what} is {value}, far from the usual {_show(watch.baseline.mean, rule.unit)}."
+
+
+def _when(forecast: Interval) -> str:
+    """The interval, in minutes if it starts after two minutes."""
+    if forecast.latest_s <= 0:
+        return "now"
+    unit, name = (60, "min") if forecast.earliest_s >= _LONG_S else (1, "s")
+    return f"in {math.floor(forecast.earliest_s / unit)} to {math.ceil(forecast.latest_s / unit)} {name}"
 
 
 def _show(value: float, unit: str) -> str:

@@ -4,6 +4,7 @@ from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
+from function_app.domain.health.detectors import WINDOW_MS
 from function_app.domain.health.diagnosis import Health, usual_range
 from function_app.domain.health.faults import Severity
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
@@ -99,9 +100,10 @@ def _field(view: FieldView) -> schemas.DiagnosticFieldOut:
         low=limits.low,
         high=limits.high,
         slope_per_s=watch.slope_per_s,
-        limit_in_s=watch.limit_in_s,
+        limit_earliest_s=None if watch.forecast is None else watch.forecast.earliest_s,
+        limit_latest_s=None if watch.forecast is None else watch.forecast.latest_s,
         findings=watch.findings,
-        updated_at=rfc3339(watch.seen_ms),
+        updated_at=rfc3339(watch.seen_ms + WINDOW_MS),
     )
 
 

@@ -51,8 +51,10 @@ class DiagnosticFieldOut(Response, frozen=True, kw_only=True):
     """One monitored field, as mean of ten seconds.
 
     ``baseline`` is the usual value; ``usual_low`` and ``usual_high`` are the usual range, null until it is known.
-    ``slope_per_s`` is the trend of the last ten minutes. ``limit_in_s`` is the time until the trend reaches a limit;
-    null: it does not. ``findings``: triggered detectors (``level``, ``trend``, ``change``, ``outlier``). ``advice``:
+    ``slope_per_s`` is the trend of the last ten minutes. The field reaches a limit between ``limit_earliest_s`` and
+    ``limit_latest_s`` after ``updated_at`` with a probability of 90 %; null: uncertain, or no limit is approached.
+    ``updated_at`` is the end of the newest mean.
+    ``findings``: triggered detectors (``level``, ``trend``, ``change``, ``outlier``). ``advice``:
     instruction of the robot type or room; empty for unlisted fields.
     """
 
@@ -70,7 +72,8 @@ class DiagnosticFieldOut(Response, frozen=True, kw_only=True):
     low: float | None
     high: float | None
     slope_per_s: float | None
-    limit_in_s: float | None
+    limit_earliest_s: float | None
+    limit_latest_s: float | None
     findings: tuple[str, ...]
     updated_at: Moment
 

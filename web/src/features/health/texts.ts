@@ -101,7 +101,7 @@ export const texts = {
     learning: "The typical range is not known yet: it takes ten minutes of measurements.",
     usual: (low: string, high: string): string => `Typical range ${low} to ${high}: between the dashed lines.`,
     slope: (rises: boolean, perMinute: string): string => `${rises ? "Rises" : "Falls"} by ${perMinute} per minute.`,
-    limitIn: (time: string): string => `At this rate, the limit is reached in about ${time}.`,
+    limitBetween: (earliest: string, latest: string): string => `The limit is reached in ${earliest} to ${latest} (90 % prediction interval).`,
     faults: "Faults in this time range",
     fault: (kind: string, from: string, to: string | null): string => `${kind}: ${to === null ? `since ${from}` : `${from} to ${to}`}`,
     rows: (shown: number, all: number): string => (shown === all ? `${all} values, newest first.` : `Newest ${shown} of ${all} values.`),

@@ -91,13 +91,18 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
   );
 }
 
+/** A time in seconds below two minutes. */
+function timeText(s: number): string {
+  return s < 120 ? `${Math.round(s)} s` : format.duration(s);
+}
+
 /** The learned range and trend as text. */
-function usual({ usual_low: low, usual_high: high, slope_per_s: slope, limit_in_s: limitInS }: MonitoredField, quantity: Quantity): string {
+function usual({ usual_low: low, usual_high: high, slope_per_s: slope, limit_earliest_s: earliestS, limit_latest_s: latestS }: MonitoredField, quantity: Quantity): string {
   const text = (value: number): string => `${valueText(quantity, value)} ${quantity.unit}`.trim();
   const sentences = [low === null || high === null ? texts.trend.learning : texts.trend.usual(text(low), text(high))];
   const perMinute = slope === null ? 0 : (quantity.toDisplay(slope) - quantity.toDisplay(0)) * 60;
   if (Math.abs(perMinute) >= 0.0005) sentences.push(texts.trend.slope(perMinute > 0, `${Math.abs(perMinute).toPrecision(2)} ${quantity.unit}`));
-  if (limitInS !== null) sentences.push(texts.trend.limitIn(format.duration(limitInS)));
+  if (earliestS !== null && latestS !== null) sentences.push(texts.trend.limitBetween(timeText(earliestS), timeText(latestS)));
   return sentences.join(" ");
 }
 

@@ -49,7 +49,9 @@ export interface MonitoredField {
   low: number | null;
   high: number | null;
   slope_per_s: number | null;
-  limit_in_s: number | null;
+  /** The limit is reached between these times after `updated_at`, with a probability of 90 %; `null`: uncertain or never. */
+  limit_earliest_s: number | null;
+  limit_latest_s: number | null;
   findings: string[];
   updated_at: string;
 }

@@ -161,7 +161,7 @@ const state = object<Required<State>>({
       progress: optional(number, 0),
     }),
   ),
-  faults: optional(list(object<Fault>({ code: text, message: text, since_ms: count }), MAX_JOINTS), []),
+  faults: optional(list(object<Fault>({ code: text, message: text, since_ms: count, count: optional(count, 1), last_ms: optional(count, 0) }), MAX_JOINTS), []),
   restrictions: optional(list(object<Restriction>({ source: text, speed: number, reason: text }), MAX_JOINTS), []),
   stiffness: optional(byName, {}),
   load: optional(count, 0),

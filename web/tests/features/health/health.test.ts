@@ -5,9 +5,9 @@ import type { Fault, MonitoredField } from "../../../src/shared/api/health";
 const fault = (code: string, more: Partial<Fault> = {}): Fault => ({
   id: code, code, state: "raised", source: "device", kind: "reported", severity: "error", message: code, stream: "",
   field: "", value: null, baseline: null, limit: null, raised_at: "2026-01-01T12:00:00.000Z", acknowledged_at: null,
-  acknowledged_by: "", cleared_at: null, count: 1, worsened: 0, ...more,
+  acknowledged_by: "", cleared_at: null, count: 1, worsened: 0, occurrences: 1, last_seen_at: null, ...more,
 });
-const reported = (code: string) => ({ code, message: code, since_ms: 1 });
+const reported = (code: string) => ({ code, message: code, since_ms: 1, count: 1, last_ms: 1 });
 const driver = fault("driver");
 const detected = fault("health.x", { source: "detector" });
 
@@ -44,7 +44,7 @@ describe("an open fault", () => {
 const watched = (more: Partial<MonitoredField>): MonitoredField => ({
   stream: "health", field: "temperature_c.elbow", label: "Joint temperature", unit: "°C", advice: "Let it rest.",
   value: 30, baseline: 30, usual_low: null, usual_high: null, warning_low: null, warning_high: 70, low: null, high: 80,
-  slope_per_s: null, limit_in_s: null, findings: [], updated_at: "2026-01-01T12:00:00Z", ...more,
+  slope_per_s: null, limit_earliest_s: null, limit_latest_s: null, findings: [], updated_at: "2026-01-01T12:00:00Z", ...more,
 });
 
 describe("a watched field", () => {

@@ -75,7 +75,7 @@ def test_an_overheating_joint_raises_a_trend_fault_before_its_limit(cloud: Cloud
     assert (fault["code"], fault["kind"], fault["limit"]) == ("health.temperature_c.elbow", "trend", 80.0)
     assert fault["value"] < 70, "the trend is reported before the warning limit"
     shown = field(anna, robot, "temperature_c.elbow")
-    assert 300 < shown["limit_in_s"] < 2_700
+    assert shown["limit_latest_s"] is None or 300 < shown["limit_earliest_s"] < shown["limit_latest_s"]
     faults.unlink()
     arm.live(60)
     anna = cloud.sign_in("anna")
