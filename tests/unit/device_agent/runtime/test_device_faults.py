@@ -76,6 +76,21 @@ def test_an_unexpected_error_in_the_control_loop_is_a_fault(harness: DeviceHarne
     eventually(lambda: harness.telemetry().mode is Mode.IDLE and harness.device._controller.fault is None)
 
 
+def test_a_recurring_error_of_the_control_loop_is_logged_once(
+    harness: DeviceHarness, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command_processor, "FAULT_STABLE_S", 1000.0)
+    failed_sends: list[object] = []
+
+    def fail(position_rad: object) -> None:
+        failed_sends.append(position_rad)
+        raise ZeroDivisionError("a bug")
+
+    with mock.patch.object(harness.driver, "send", fail):
+        eventually(lambda: len(failed_sends) >= 3)
+    assert len([record for record in caplog.records if record.exc_info]) == 1
+
+
 def test_commands_beyond_the_queue_are_rejected(harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch) -> None:
     busy, go_on = threading.Event(), threading.Event()
 

@@ -2,6 +2,7 @@
 
 from unittest import mock
 
+import msgspec
 import pytest
 
 from device_agent.config.interlock_rule import InterlockRule
@@ -9,10 +10,11 @@ from device_agent.ports.sensor import SensorError
 from device_agent.protocol import CollectData, Mode, ResetStop, SetControl, StopDevice, TakePicture
 from device_agent.protocol.codec import MAX_BYTES
 from device_agent.protocol.events import EventKind
+from device_agent.protocol.manifests.room import Watch
 from device_agent.runtime.commands import command_processor
 from tests.harness.agent.device_harness import eventually, wait_for_state
 from tests.unit.device_agent.runtime.room.conftest import MakeRoomDevice
-from tests.unit.device_agent.runtime.room.room_device_fixture import RoomDeviceHarness, await_growth
+from tests.unit.device_agent.runtime.room.room_device_fixture import ENTRY, RoomDeviceHarness, await_growth
 
 SET = SetControl(control="opening", value=0.1)
 
@@ -69,11 +71,30 @@ def test_a_sensor_that_fails_after_each_reconnection_is_one_fault_event_and_log_
     assert len([record for record in caplog.records if "no answer" in record.getMessage()]) == 1
 
 
-def test_an_unexpected_driver_error_is_a_fault_and_the_loop_continues(harness: RoomDeviceHarness) -> None:
-    with mock.patch.object(harness.sensor, "read", side_effect=ZeroDivisionError):
+def test_an_unexpected_driver_error_is_a_fault_with_one_traceback_and_the_loop_continues(
+    harness: RoomDeviceHarness, caplog: pytest.LogCaptureFixture
+) -> None:
+    reads: list[str] = []
+
+    def fail(stream: str) -> None:
+        reads.append(stream)
+        raise ZeroDivisionError
+
+    with mock.patch.object(harness.sensor, "read", fail):
         assert "internal error" in wait_for_state(harness, lambda state: state.faults).faults[0].message
+        eventually(lambda: len(reads) >= 3)
+    assert len([record for record in caplog.records if record.exc_info]) == 1
     wait_for_state(harness, lambda state: not state.faults)
     await_growth(harness.measured)
+
+
+def test_a_silent_stream_is_a_fault_of_its_own(make_room_device: MakeRoomDevice) -> None:
+    entry = msgspec.structs.replace(ENTRY, watch=(Watch(source="rain", silent_s=0.1),))
+    harness = make_room_device(entry=entry)
+    assert wait_for_state(harness, lambda state: state.faults).faults[0].code == "silent.rain"
+    with mock.patch.object(harness.sensor, "read", return_value={"mm": 1.0}):
+        wait_for_state(harness, lambda state: not state.faults)
+    assert harness.events(EventKind.DRIVER_FAILED) == harness.events(EventKind.DRIVER_RECOVERED) == []
 
 
 def test_an_interlock_holds_a_room_device(make_room_device: MakeRoomDevice) -> None:
