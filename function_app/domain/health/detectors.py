@@ -139,7 +139,7 @@ class DetectorState:
     Attributes:
         seen_ms: Start of the newest window [ms since 1970].
         value: Mean of that window.
-        recent: Time [ms] and mean of the newest windows.
+        recent: Number since 1970 and mean of the newest windows, for the forecast.
         minutes: Means of the newest whole minutes, without gaps.
         minute: Sum and count of the windows of the current minute.
         slope_per_s: Slope [unit/s].
@@ -215,7 +215,7 @@ def update(previous: DetectorState, limits: Limits, at_ms: int, value: float) ->
         previous,
         seen_ms=at_ms,
         value=value,
-        recent=(*previous.recent, (at_ms, value))[-SHORT[-1] :],
+        recent=_recent(previous, limits, at_ms, value),
         baseline=learn(previous.baseline, value, scale=spread, repeated=value == previous.value),
         level=_level(previous.level, limits.warning_low, limits.warning_high, limits, value),
         breach=_level(previous.breach, limits.low, limits.high, limits, value),
@@ -275,12 +275,21 @@ SOON_S = 600.0
 """A trend is reported at once if its forecast ends within this time [s]."""
 
 
+def _recent(previous: DetectorState, limits: Limits, at_ms: int, value: float) -> tuple[tuple[int, float], ...]:
+    """The newest windows for the forecast, with seven digits, so that the state stays small."""
+    if TREND not in limits.kinds or limits.lowest is limits.highest is None:
+        return ()
+    window = at_ms // WINDOW_MS
+    earlier = tuple(each for each in previous.recent if each[0] < window)
+    return (*earlier, (window, float(f"{value:.7g}")))[-SHORT[-1] :]
+
+
 def _forecast(after: DetectorState, limits: Limits) -> DetectorState:
     """Forecast the time to a limit, from the end of the newest window."""
-    if TREND not in limits.kinds or limits.lowest is limits.highest is None or len(after.recent) < SHORT[0]:
+    if len(after.recent) < SHORT[0]:
         return replace(after, forecast=None)
     now_ms = after.seen_ms + WINDOW_MS
-    recent = [((at_ms + WINDOW_MS / 2 - now_ms) / 1000, value) for at_ms, value in after.recent]
+    recent = [(((window + 0.5) * WINDOW_MS - now_ms) / 1000, value) for window, value in after.recent]
     newest_ms = after.seen_ms // MINUTE_MS * MINUTE_MS - MINUTE_MS / 2 - now_ms
     count = len(after.minutes)
     minutes = [((newest_ms - (count - 1 - place) * MINUTE_MS) / 1000, mean) for place, mean in enumerate(after.minutes)]
