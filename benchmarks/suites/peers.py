@@ -22,8 +22,8 @@ PEERS: Final = {
 }
 _ABOUT: Final = """A setpoint for six joints until telemetry reports it as applied, 40 per second like the console.
 Robot, operator and server are separate processes on loopback. The robot is the same simulated UR5 with the same driver.
-Telescope is the product as `make up` starts it, with lease, loop age, limits, self-collision check and stored telemetry.
-The other programs use their own library, apply each setpoint and report it immediately."""
+Telescope is the product as `make up` starts it, with lease, loop age, limits, self-collision check and stored
+telemetry. The other programs use their own library, apply each setpoint and report it immediately."""
 _HOW: Final = """rosbridge: `roslibpy` at both ends and a server of the rosbridge protocol without ROS, which costs
 less than a real one. zenoh: two peers over TCP without a router, `express`. gRPC: a bidirectional stream of bytes
 with asyncio at the robot, without protobuf. Foxglove: the SDK's server at the robot, to which the operator publishes.

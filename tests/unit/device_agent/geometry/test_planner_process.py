@@ -117,7 +117,7 @@ def controller(shape: MujocoGeometry) -> Controller:
     return controller
 
 
-def cross_while(shape: MujocoGeometry, controller: Controller, event: Callable[[], None]) -> Refused:
+def cross_while(shape: MujocoGeometry, controller: Controller, event: Callable[[], object]) -> Refused:
     """Request an impossible motion, cause the event during planning, and return the rejection."""
     body = DeviceContext(
         robot_type=KIND,
