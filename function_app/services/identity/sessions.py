@@ -187,7 +187,7 @@ class Sessions:
             self._used_ms.popitem(last=False)
 
         def used(session: Session | None) -> Session | None:
-            if session is None or now_ms - session.used_ms < USE_MS:
+            if session is None or now_ms - max(session.since_ms, session.used_ms) < USE_MS:
                 return None
             return replace(session, used_ms=now_ms, address=origin.address, program=origin.program[:_SHOWN])
 

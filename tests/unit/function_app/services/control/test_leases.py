@@ -21,7 +21,8 @@ def test_a_lease_is_acquired_confirmed_renewed_and_released(anna: Person, robot:
     assert (renewed["epoch"], renewed["confirmed"]) == (1, True)
     assert renewed["expires_at"] > acquired["expires_at"]
     shown = anna.get(f"/devices/{robot.device}").json()["lease"]
-    expected = {"holder": "anna", "epoch": 1, "expires_at": renewed["expires_at"], "mine": True}
+    owner = {"holder": "anna", "holder_account": anna.account}
+    expected = {**owner, "epoch": 1, "expires_at": renewed["expires_at"], "mine": True}
     assert shown == {**expected, "reason": "", "request": None}
     assert anna.get(path).json() == {"lease": shown}
     assert anna.delete(f"{path}?epoch=1").status_code == 204
