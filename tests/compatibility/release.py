@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tests.harness.paths import ROOT
 
-RELEASE = "190440b7e323db07d6e2a2f5133282d26e63dfad"
+RELEASE = "7dd838ca61021ffdf9380bdba1ac7d8eae599103"
 """Commit of the newest release: an ancestor of this one. Set it to the released commit after each release."""
 PARTS = ("function_app", "device_agent", "infra", "robots")
 
