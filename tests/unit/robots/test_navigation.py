@@ -216,3 +216,13 @@ def test_qbo_visits_a_walking_person(settle_s: float) -> None:
     lab.close()
     assert lines[0].startswith("stands"), lines
     assert lines[1] == "Hello!"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("dx_m", "dy_m"), [(0.0, 0.5), (-0.4, -0.4)])
+def test_nao_walks_to_a_place(dx_m: float, dy_m: float) -> None:
+    lab = Laboratory(robot="nao")
+    x, y, _ = lab.pose
+    lab.robot.execute(GoTo(x_m=x + dx_m, y_m=y + dy_m))
+    assert math.dist(lab.pose[:2], (x + dx_m, y + dy_m)) <= NEAR_M
+    lab.close()
