@@ -35,7 +35,7 @@ def test_a_stop_without_a_gateway_is_delivered_later(site: XmppSite, anna: Perso
     site.gateways.pop().end()
     wait_until(lambda: robot.changes[-1] is False, "the loss of the link")
     wait_until(lambda: not anna.get(f"/devices/{robot.device}").json()["online"], "offline")
-    assert anna.post(f"/devices/{robot.device}/stop").json()["outcome"] == "sent"
+    assert anna.post(f"/devices/{robot.device}/stop").json()["outcome"] == "unreachable"
     site.start_gateway()
     wait_until(lambda: robot.changes[-1] is True, "the new link")
     wait_until(lambda: robot.received(StopDevice), "the delayed Stop")

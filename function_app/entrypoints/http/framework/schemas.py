@@ -27,7 +27,7 @@ class AgentRequest(Request, frozen=True, kw_only=True, forbid_unknown_fields=Fal
 class LabelledRequest(Request, frozen=True, kw_only=True):
     """Base class of request bodies with text for other users, named in ``labels``. See ``domain/common/text.py``."""
 
-    labels: ClassVar[tuple[str, ...]]
+    labels: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         for field in self.labels:

@@ -228,6 +228,14 @@ def test_go_to_corrects_the_pose_at_rest_and_fails_if_the_robot_is_not_at_the_go
                 robot.api.execute(GoTo(x_m=0.3, y_m=0.0))
 
 
+def test_arrival_at_rest_is_measured_against_position_and_heading() -> None:
+    navigator = navigator_to((1.0, 0.0), 0.0)
+    navigator.require_arrival(Pose2D(1.05, 0.0, 0.05))
+    for pose in (Pose2D(1.1, 0.0, 0.0), Pose2D(1.0, 0.0, 0.2)):
+        with refuses("not_arrived"):
+            navigator.require_arrival(pose)
+
+
 @pytest.mark.parametrize(
     ("obstacle_map", "x_m", "code"),
     [(None, 1.0, "no_ground"), (room((0.5, -2, 0.7, 2)), 0.6, "taken"), (room(), 9.0, "out_of_room")],

@@ -41,7 +41,7 @@ def test_presence_and_state_are_shown(anna: Person, robot: Robot) -> None:
     stop = StopLatch(caller="anna", reason="test", at_ms=4)
     robot.publish_state(state(stop=stop, lease=LeaseState(holder="anna", epoch=3, expires_in_ms=100)))
     shown = anna.get(f"/devices/{robot.device}").json()
-    assert shown["state"]["stop"] == {"caller": "anna", "reason": "test", "at_ms": 4}
+    assert shown["state"]["stop"] == {"caller": "anna", "reason": "test", "at_ms": 4, "verified": False}
     assert shown["state"]["lease"]["expires_in_ms"] == 100
     assert shown["online"] is True
     assert shown["last_seen_at"].endswith("Z")

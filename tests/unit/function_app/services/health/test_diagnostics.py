@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import JointTelemetry, Measurements, Mode, State, codec, topics
+from device_agent.protocol import Description, Joint, JointTelemetry, Measurements, Mode, State, codec, topics
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
@@ -172,6 +172,15 @@ def test_a_change_of_a_value_without_limits_is_an_info(cloud: Cloud, anna: Perso
 
 
 def test_effort_is_monitored_and_positions_are_not(cloud: Cloud, anna: Person, robot: Robot) -> None:
+    joint = Joint(
+        name="elbow", label="Elbow", lower_rad=-1, upper_rad=1, max_velocity_rad_s=1, max_acceleration_rad_s2=1,
+        max_jerk_rad_s3=1, max_effort_nm=150,
+    )  # fmt: skip
+    robot.publish(
+        robot.topic(topics.DESC),
+        Description(device="arm", kind="arm", robot_type="ur5", label="Arm", joints=(joint,)),
+        retain=True,
+    )
 
     def joints(effort_nm: float) -> Iterable[tuple[str, bytes]]:
         for _ in range(6):
@@ -190,7 +199,7 @@ def test_effort_is_monitored_and_positions_are_not(cloud: Cloud, anna: Person, r
             yield topics.device(robot.space, robot.id, "arm", topics.TELE, topics.JOINTS), codec.encode(telemetry)
 
     cloud.run(ingest_telemetry(cloud.functions, list(joints(-40.0))))
-    assert [item["field"] for item in diagnostics(anna, robot)["fields"]] == ["effort_nm.0"]
+    assert [item["field"] for item in diagnostics(anna, robot)["fields"]] == ["effort_nm.elbow"]
     cloud.run(ingest_telemetry(cloud.functions, list(joints(-130.0))))
     (fault,) = open_faults(anna, robot)
     assert (fault["kind"], fault["limit"], fault["stream"]) == ("level", -120.0, "joints")
