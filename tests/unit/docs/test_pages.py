@@ -126,11 +126,24 @@ def test_each_file_of_the_change_requests_exists() -> None:
     assert [path for path in paths if not (ROOT / path).is_file()] == []
 
 
-@pytest.mark.parametrize("row", [row for row in SECURITY.splitlines() if re.match(r"\| (?!---|asset|risk)", row)])
+@pytest.mark.parametrize(
+    "row", [row for row in SECURITY.splitlines() if re.match(r"\| (?!---|asset|attacker|risk)", row)]
+)
 def test_each_row_of_the_security_page_names_existing_tests(row: str) -> None:
     tests = re.findall(r"`(tests/[\w/]+\.py)::(test_\w+)`", row)
     assert tests
     assert [test for path, test in tests if f"def {test}(" not in (ROOT / path).read_text()] == []
+
+
+def test_the_security_page_states_what_each_attacker_can_still_do() -> None:
+    section = SECURITY.partition("## What each attacker can still do")[2].partition("\n## ")[0]
+    rows = [[cell.strip() for cell in line.split("|")[1:3]] for line in section.splitlines() if line.startswith("| ")][
+        2:
+    ]
+    attackers = [attacker for attacker, _ in rows if attacker]
+    assert [target for _, target in rows] == ["motion", "data", "availability"] * len(attackers)
+    named = {"broker", "function", "store", "agent in the same space", "script", "local user", "network"}
+    assert {name for name in named if not any(name in attacker for attacker in attackers)} == set()
 
 
 def test_the_security_page_has_a_row_for_each_api_risk() -> None:
