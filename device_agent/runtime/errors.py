@@ -1,4 +1,6 @@
-"""The rejection error of the runtime."""
+"""The rejection error of the runtime, and the message for errors without a cause that a user can remove."""
+
+INTERNAL_ERROR = "internal error of the agent; its log contains the details"
 
 
 class Refused(Exception):  # noqa: N818 (a rejection is a normal response, not a malfunction)

@@ -41,7 +41,7 @@ from device_agent.runtime.authority.event_recorder import EventRecord, EventReco
 from device_agent.runtime.authority.fault_reporter import FaultReporter
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.errors import Refused
+from device_agent.runtime.errors import INTERNAL_ERROR, Refused
 from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.storage.journal import Journal, JournalError
 from device_agent.runtime.telemetry.device_publisher import DevicePublisher, StateSnapshot
@@ -185,9 +185,9 @@ class CommandProcessor:
             self._reject(command, refused)
         except JournalError:
             raise
-        except Exception as error:  # noqa: BLE001 (every command gets a terminal ack)
+        except Exception:  # noqa: BLE001 (every command gets a terminal ack)
             _log.exception("%s: command %s", self._name, command.id)
-            self._reject(command, Refused("internal", f"internal error: {error}; see the agent's log"))
+            self._reject(command, Refused("internal", INTERNAL_ERROR))
 
     def _reject(self, command: Command, refused: Refused) -> None:
         status = AckStatus.EXPIRED if refused.code == "expired" else AckStatus.FAILED

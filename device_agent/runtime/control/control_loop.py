@@ -19,6 +19,7 @@ from device_agent.protocol import JointTelemetry, Mode
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.errors import INTERNAL_ERROR
 from device_agent.runtime.load import LoadGovernor
 
 IDLE_RATE_HZ = 20.0
@@ -170,10 +171,10 @@ class ControlLoop:
         except DriverError as error:
             self._error = str(error)
         except Exception as error:  # noqa: BLE001 (any error holds the device until the driver responds)
-            self._error = f"internal error: {error}"
-            if self._error != self._logged:
+            self._error = INTERNAL_ERROR
+            if repr(error) != self._logged:
                 _log.exception("%s: control loop", self._name)
-            self._logged = self._error
+            self._logged = repr(error)
         if self._error:
             self._requested.set()  # wakes the loop's thread, which handles the fault
         self._ran_early = early

@@ -18,6 +18,7 @@ from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.errors import INTERNAL_ERROR
 from device_agent.runtime.room.room_device import RoomDevice
 
 _CHECK_PERIOD_S = 0.05
@@ -108,11 +109,10 @@ class SensorLoop:
             except SensorError as error:
                 self._set_fault(str(error))
             except Exception as error:  # noqa: BLE001 (any error is reported as a fault)
-                message = f"internal error: {error}"
-                if message != self._logged:
+                if repr(error) != self._logged:
                     _log.exception("%s: sensing", self._name)
-                self._logged = message
-                self._set_fault(message)
+                self._logged = repr(error)
+                self._set_fault(INTERNAL_ERROR)
             self._pause()
 
     def _pause(self) -> None:

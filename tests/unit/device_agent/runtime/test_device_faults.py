@@ -14,6 +14,7 @@ from device_agent.protocol import Ack, AckStatus, Event, Mode, MoveJoints, topic
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.commands import command_processor
 from device_agent.runtime.commands.command_processor import CommandProcessor
+from device_agent.runtime.errors import INTERNAL_ERROR
 from device_agent.runtime.storage.journal import Journal, JournalError
 from tests.harness.agent.device_harness import DeviceHarness, eventually
 
@@ -72,7 +73,7 @@ def test_nothing_moves_if_the_journal_cannot_be_written(
 
 def test_an_unexpected_error_in_the_control_loop_is_a_fault(harness: DeviceHarness) -> None:
     with mock.patch.object(harness.driver, "observe", broken):
-        eventually(lambda: harness.device._controller.fault == "internal error: a bug")
+        eventually(lambda: harness.device._controller.fault == INTERNAL_ERROR)
     eventually(lambda: harness.telemetry().mode is Mode.IDLE and harness.device._controller.fault is None)
 
 

@@ -12,6 +12,7 @@ from device_agent.protocol.codec import MAX_BYTES
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.manifests.room import Watch
 from device_agent.runtime.commands import command_processor
+from device_agent.runtime.errors import INTERNAL_ERROR
 from tests.harness.agent.device_harness import eventually, wait_for_state
 from tests.unit.device_agent.runtime.room.conftest import MakeRoomDevice
 from tests.unit.device_agent.runtime.room.room_device_fixture import ENTRY, RoomDeviceHarness, await_growth
@@ -81,7 +82,7 @@ def test_an_unexpected_driver_error_is_a_fault_with_one_traceback_and_the_loop_c
         raise ZeroDivisionError
 
     with mock.patch.object(harness.sensor, "read", fail):
-        assert "internal error" in wait_for_state(harness, lambda state: state.faults).faults[0].message
+        assert wait_for_state(harness, lambda state: state.faults).faults[0].message == INTERNAL_ERROR
         eventually(lambda: len(reads) >= 3)
     assert len([record for record in caplog.records if record.exc_info]) == 1
     wait_for_state(harness, lambda state: not state.faults)
