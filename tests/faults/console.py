@@ -114,6 +114,7 @@ class Link:
             pass
         client.disconnect()
         client.loop_stop()
+        client._reset_sockets()  # see function_app/adapters/shared/mqtt_client.py
 
 
 def _disable_nagle(_client: paho.Client, _userdata: Any, opened: Any) -> None:

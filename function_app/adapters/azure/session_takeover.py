@@ -8,6 +8,7 @@ import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
+from function_app.adapters.shared.mqtt_client import close_client
 from function_app.ports.broker_access import BrokerAccessError, Credentials
 
 TIMEOUT_S = 10.0
@@ -64,7 +65,6 @@ class SessionTakeover:
         except OSError as error:
             raise BrokerAccessError(f"{broker} cannot be reached: {error}") from error
         finally:
-            client.disconnect()
-            await asyncio.to_thread(client.loop_stop)
+            await close_client(client)
         if problem:
             raise BrokerAccessError(f"{broker} does not let the functions disconnect {client_id}: {problem}")

@@ -22,6 +22,7 @@ from device_agent.protocol.security.grants import Grant
 from device_agent.protocol.security.revocation import Control, Revoke
 from function_app.adapters.local import mosquitto_clients
 from function_app.adapters.local.mosquitto_clients import ClientQuota, IssuedClient
+from function_app.adapters.shared.mqtt_client import close_client
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials, check_revocation
 
 Publish = Callable[[str, bytes], Awaitable[None]]
@@ -236,8 +237,7 @@ class _ControlConnection:
         """Disconnect."""
         client, self._client = self._client, None
         if client is not None:
-            client.disconnect()
-            await asyncio.to_thread(client.loop_stop)
+            await close_client(client)
 
     async def _open(self, service: ServiceCredentials) -> None:
         await self.close()

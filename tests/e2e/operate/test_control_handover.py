@@ -21,6 +21,7 @@ def two(machine: Machine) -> Iterator[tuple[Api, Api, str]]:
     """Two sessions of one owner and the arm, which is free and not stopped before and after."""
     with machine.api() as ann, machine.api() as bob:
         device = ann.device()["id"]
+        wait_until(lambda: ann.device()["lease"] is None, "the end of the lease of an earlier page")
         yield ann, bob, device
         with contextlib.suppress(AssertionError):
             ann.post(f"/devices/{device}/stop/reset")

@@ -162,6 +162,7 @@ class Client:
     def close(self) -> None:
         self.paho.disconnect()
         self.paho.loop_stop()
+        self.paho._reset_sockets()  # paho's own finalizer may run after the one of its wake-up sockets, which warns
 
     def __enter__(self) -> Self:
         return self
