@@ -41,10 +41,7 @@ T = TypeVar("T")
 
 
 def wait_until(condition: Callable[[], object], what: str, timeout_s: float = PATIENCE_S) -> None:
-    """Poll until ``condition`` holds; fails with ``what`` after the timeout.
-
-    The interval grows with the waiting time, to keep the load low.
-    """
+    """Poll until ``condition`` holds, at a growing interval; fails with ``what`` after the timeout."""
     start = time.monotonic()
     while not condition():
         waited_s = time.monotonic() - start
@@ -162,7 +159,7 @@ class Client:
     def close(self) -> None:
         self.paho.disconnect()
         self.paho.loop_stop()
-        self.paho._reset_sockets()  # paho's own finalizer may run after the one of its wake-up sockets, which warns
+        self.paho._reset_sockets()  # see function_app/adapters/shared/mqtt_client.py
 
     def __enter__(self) -> Self:
         return self
