@@ -140,7 +140,9 @@ class Conversation:
         self.anna.get("/robot-types/none")
         self.anna.get("/robot-types/ur5/movements", params={"limit": 1})
         assert self.anna.put(MINE, {"source": SOURCE}).status_code == 201
-        self.anna.put(MINE, {"source": SOURCE + "#", "description": UNUSUAL.replace("\u0001", "")})
+        assert self.anna.put(MINE, {"source": SOURCE, "description": UNUSUAL}).status_code == 422
+        printable = "".join(each for each in UNUSUAL if each.isprintable())
+        assert self.anna.put(MINE, {"source": SOURCE + "#", "description": printable}).status_code == 200
         self.anna.put(MINE, {"source": ""})
         self.anna.put("/robot-types/ur5/movements/a%20b", {"source": SOURCE})
         self.anna.get(MINE)

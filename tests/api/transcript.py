@@ -15,7 +15,7 @@ _NAMED = frozenset({"id", "agent", "account", "session", "space", "action", "upl
 """Fields whose value is an id, which is also replaced inside other texts."""
 _SECRET = frozenset(
     {"access_token", "csrf_token", "token", "claim_code", "password", "username", "url", "cursor", "key", "port",
-     "broker", "websocket_url", "headers", "signature", "bins", "ms"}
+     "broker", "websocket_url", "headers", "signature", "bins", "ms", "setpoint_key", "device_token", "pairing"}
 )  # fmt: skip
 _TIMES = ("_ms", "_at", "_in_s", "at")
 _DURATIONS = frozenset({"lease_ms", "queue_ms", "ttl_ms", "timeout_ms", "wait_ms"})
