@@ -26,8 +26,8 @@ _RESOLUTION_S = 10.0
 """Shortest interval: values are means over ten seconds [s]."""
 _EARLIER = 0.93
 """Factor of the earliest time, for rises that become faster."""
-_UNSEEN = 0.15
-"""A slope may decrease by this share from one half of its window to the other without being seen to."""
+_STEADY = 0.15
+"""A slope may decrease by this share from one half of its window to the other and still count as constant."""
 _WIDEST, _SLACK_S = 4.0, 60.0
 """The latest time is at most this multiple of the earliest one, or this much later [s]."""
 
@@ -133,7 +133,7 @@ class _Line:
         older = max(direction * self._older, direction * self.slope, middle)
         steepest = max(direction * self.slope, newer, middle) + self._error
         flattest = min(direction * self.slope, newer) - self._error
-        slowing = _UNSEEN + max(0.0, older - newer + self._half_error) / older
+        slowing = _STEADY + max(0.0, older - newer + self._half_error) / older
         decay_per_s = -math.log1p(-min(slowing, 0.95)) / self._apart_s
         flattest *= math.exp(decay_per_s * self._newer_s)  # from the middle of the newer half until now
         if flattest <= 0 or decay_per_s * far >= flattest:
