@@ -4,6 +4,7 @@ A test class inherits ``TransportSuite`` and sets ``spoken``. If the transport c
 broker, the class overrides the fixture ``processes`` and adds its endpoint to ``processes.endpoints``.
 """
 
+import contextlib
 import itertools
 import json
 import threading
@@ -17,6 +18,7 @@ import pytest
 
 from device_agent.protocol import Ack, AckStatus, Event, Fault, Measurements, Mode, State, codec, topics
 from function_app.domain.common.ids import command_id
+from function_app.ports.command_bus import BusUnavailable
 from tests.harness.cloud.cloud_processes import CloudProcesses, Link
 from tests.harness.network.brokers import BrokerKind, wait_until
 
@@ -60,7 +62,8 @@ class TransportSuite:
     def test_commands_arrive_unchanged_in_order_and_expired_ones_do_not(
         self, processes: CloudProcesses, link: Link
     ) -> None:
-        processes.publish_retained(link.topic(topics.CMD), b'{"retained":1}')
+        with contextlib.suppress(BusUnavailable):  # the embedded broker rejects a retained command
+            processes.publish_retained(link.topic(topics.CMD), b'{"retained":1}')
         processes.send(link.robot, b'{"expired":1}', in_ms=1)
         time.sleep(0.01)
         link.start().up()

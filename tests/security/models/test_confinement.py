@@ -103,6 +103,6 @@ def test_a_machine_without_a_layer_refuses_unless_the_operator_accepts_it(
 
 
 def test_another_system_than_linux_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plant(tmp_path, monkeypatch, prelude="sys.platform = 'darwin'")
+    plant(tmp_path, monkeypatch, prelude="import mujoco\nsys.platform = 'darwin'")
     with pytest.raises(CompilerMissingError, match=r"cannot confine.*Linux"):
         check(MujocoCompiler())
