@@ -24,7 +24,7 @@ WINDOW_S = 1.0
 MIN_PERIODS = 10
 """Fewer periods in a window decide nothing."""
 LATE_SHARE = 0.1
-"""Share of late periods that raises the level."""
+"""The level rises when at least this share of the periods is late."""
 CALM_S = 10.0
 """Time without a late window after which the level falls [s]."""
 _log = logging.getLogger(__name__)

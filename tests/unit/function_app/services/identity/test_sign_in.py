@@ -47,7 +47,8 @@ def test_the_same_name_is_the_same_account_with_one_space(cloud: Cloud) -> None:
     assert one.account == two.account
     assert one.session != two.session
     me = {"id": one.account, "name": "anna", "session": one.session, "csrf_token": None}
-    assert one.get("/accounts/me").json().items() >= me.items()
+    storage = {"device_limit_bytes": 10_000_000_000, "devices": {}, "limit_bytes": 20_000_000_000, "used_bytes": 0}
+    assert one.get("/accounts/me").json() == {**me, "storage": storage}
     (space,) = one.get("/spaces").json()["items"]
     owner = {"id": one.account, "name": "anna"}
     assert space == {"id": space["id"], "name": "Home", "role": "owner", "owner": owner}
