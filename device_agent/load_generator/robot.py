@@ -241,7 +241,7 @@ class SimulatedRobot:
             elif parsed.kind == topics.CMD:
                 self._process(payload)
             elif parsed.kind == topics.CTL:
-                self._accept_setpoint(parsed.name, topic, payload)
+                self._accept_setpoint(parsed.name, payload)
             elif parsed.kind == topics.STOP:
                 stop = codec.decode(payload, Stop)
                 reason = printable(stop.reason[:2000])
@@ -254,11 +254,11 @@ class SimulatedRobot:
         self._arm.advance(now_s)
         self._authority.expire(now_s)
 
-    def _accept_setpoint(self, epoch: str, topic: str, payload: bytes) -> None:
+    def _accept_setpoint(self, epoch: str, payload: bytes) -> None:
         lease = self._authority.lease(self._now_s)
         if lease is None or epoch != str(lease.epoch):
             raise Refused("no_lease", "this lease is not in force")
-        setpoint = codec.decode(setpoints.open_sealed(payload, lease.keys, topic), Setpoint)
+        setpoint = codec.decode(setpoints.open_sealed(payload, lease.keys), Setpoint)
         if setpoint.epoch != lease.epoch:
             raise Refused("no_lease", "the epochs in the topic and in the message differ")
         previous = self._setpoint

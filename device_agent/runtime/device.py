@@ -273,8 +273,7 @@ class Device:
         lease = self._controller.lease(now_s)
         if lease is None or topic.name != str(lease.epoch):
             raise Refused("no_lease", f"lease {topic.name} is not in force")
-        address = topics.device(*topic)
-        setpoint = codec.decode(setpoints.open_sealed(payload, lease.keys, address), Setpoint)
+        setpoint = codec.decode(setpoints.open_sealed(payload, lease.keys), Setpoint)
         self._controller.accept_setpoint(setpoint, now_s=now_s, tick_ms=tick_ms())
         self._wake()
 

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from device_agent.protocol import JointTarget, Mode, Setpoint, StopLatch
+from device_agent.protocol.security.setpoints import SetpointKeys
 from device_agent.runtime.authority.lease_gate import Lease, LeaseGate
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
@@ -247,7 +248,7 @@ class NoCheck(LeaseGate):
     """A gate that accepts every holder, past or present."""
 
     def grant(
-        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: tuple[bytes, ...] = ()
+        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: SetpointKeys = ()
     ) -> None:
         """Accept every grant."""
         self.epoch, self.burned = epoch, 0
@@ -275,7 +276,7 @@ class ExpiryOnly(LeaseGate):
         self._until_s: dict[object, float] = {}
 
     def grant(
-        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: tuple[bytes, ...] = ()
+        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: SetpointKeys = ()
     ) -> None:
         """Accept every grant."""
         self._until_s[epoch] = now_s + lease_s

@@ -54,13 +54,37 @@ def lease_key(own: Ed25519PrivateKey, other: Ed25519PublicKey, *, topic: str, pa
     return HKDF(algorithm=hashes.SHA256(), length=KEY_BYTES, salt=None, info=info).derive(shared)
 
 
+class SetpointKey:
+    """The key of one lease, prepared for its topic: a tag then takes half the time.
+
+    Args:
+        key: Key of the lease.
+        topic: Topic of its setpoints.
+    """
+
+    def __init__(self, key: bytes, topic: str) -> None:
+        # Given a Python function, hmac copies two SHA-256 states. With its name it calls OpenSSL's HMAC, which takes
+        # twice as long for a short message.
+        self._hmac = hmac.new(key, b"%s%s\n" % (_CONTEXT, topic.encode()), _sha256)
+
+    def tag(self, body: bytes) -> bytes:
+        """The tag of a setpoint, in hexadecimal."""
+        digest = self._hmac.copy()
+        digest.update(body)
+        return digest.hexdigest()[:_TAG_DIGITS].encode()
+
+
+SetpointKeys = tuple[SetpointKey, ...]
+"""Any of them may authenticate a setpoint."""
+
+
 def seal(body: bytes, key: bytes, topic: str) -> bytes:
     """The message with the tag of ``body`` (JSON), ready to publish on ``topic``."""
-    return b'{"tag":"%s","body":%s}' % (_tag(body, key, topic), body)
+    return b'{"tag":"%s","body":%s}' % (SetpointKey(key, topic).tag(body), body)
 
 
-def open_sealed(payload: bytes, keys: tuple[bytes, ...], topic: str) -> bytes:
-    """The body of a message that was sealed for ``topic`` with one of ``keys``.
+def open_sealed(payload: bytes, keys: SetpointKeys) -> bytes:
+    """The body of a message that was sealed with one of ``keys`` and for its topic.
 
     Raises:
         SignatureError: The tag does not match.
@@ -70,14 +94,13 @@ def open_sealed(payload: bytes, keys: tuple[bytes, ...], topic: str) -> bytes:
         raise ProtocolError(f"the setpoint has {len(payload)} bytes; the limit is {MAX_BYTES}")
     message = codec.decode(payload, Tagged)
     body, tag = bytes(message.body), message.tag.encode()
-    if not any(hmac.compare_digest(_tag(body, key, topic), tag) for key in keys):
+    if not any(hmac.compare_digest(key.tag(body), tag) for key in keys):
         raise SignatureError("the setpoint is not authenticated with the key of this lease")
     return body
 
 
-def _tag(body: bytes, key: bytes, topic: str) -> bytes:
-    digest = hmac.digest(key, b"%s%s\n%s" % (_CONTEXT, topic.encode(), body), "sha256")
-    return digest.hex()[:_TAG_DIGITS].encode()
+def _sha256(data: bytes = b"") -> "hashlib._Hash":
+    return hashlib.sha256(data)
 
 
 def _x25519(key: Ed25519PublicKey) -> X25519PublicKey:

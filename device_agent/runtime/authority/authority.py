@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from device_agent.protocol import StopLatch
 from device_agent.protocol.events import EventKind
+from device_agent.protocol.security.setpoints import SetpointKeys
 from device_agent.runtime.authority.event_recorder import EventRecord, RecordEvent, Severity
 from device_agent.runtime.authority.lease_gate import Lease, LeaseGate
 from device_agent.runtime.authority.speed_restrictions import Restrictions
@@ -70,7 +71,7 @@ class Authority:
         return self._gate.current(now_s)
 
     def grant(
-        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: tuple[bytes, ...] = ()
+        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: SetpointKeys = ()
     ) -> bool:
         """See ``Controller.grant``. Returns True if the epoch is new and the previous holder lost control."""
         before, previous = self._gate.epoch, self._gate.granted

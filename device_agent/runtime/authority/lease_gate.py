@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from device_agent.protocol.security.setpoints import SetpointKeys
 from device_agent.runtime.errors import Refused
 
 
@@ -17,7 +18,7 @@ class Lease:
     epoch: int
     expires_s: float
     reason: str = ""
-    keys: tuple[bytes, ...] = field(default=(), repr=False)
+    keys: SetpointKeys = field(default=(), repr=False)
 
 
 class LeaseGate:
@@ -33,7 +34,7 @@ class LeaseGate:
         self._lease: Lease | None = None
 
     def grant(
-        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: tuple[bytes, ...] = ()
+        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: SetpointKeys = ()
     ) -> None:
         """Accept a signed grant or renewal.
 

@@ -13,6 +13,7 @@ from device_agent.protocol import codec
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import key_rotation, setpoints, signing
 from device_agent.protocol.security.key_rotation import NewKey
+from device_agent.protocol.security.setpoints import SetpointKey, SetpointKeys
 from device_agent.runtime.errors import Refused
 
 _log = logging.getLogger(__name__)
@@ -67,9 +68,10 @@ class PinnedKeys(Mapping[str, Ed25519PublicKey]):
         with self._lock:
             return self._pairing.serial
 
-    def setpoint_keys(self, topic: str, pairing: str) -> tuple[bytes, ...]:
+    def setpoint_keys(self, topic: str, pairing: str) -> SetpointKeys:
         """Keys that authenticate setpoints on ``topic``, one per valid pinned key; see ``setpoints.lease_key``."""
-        return tuple(setpoints.lease_key(self._identity, key, topic=topic, pairing=pairing) for key in self.values())
+        keys = (setpoints.lease_key(self._identity, key, topic=topic, pairing=pairing) for key in self.values())
+        return tuple(SetpointKey(key, topic) for key in keys)
 
     def follow(self, statements: Iterable[str]) -> None:
         """Pin the keys that the statements introduce, oldest first. Keys that are pinned already are skipped.

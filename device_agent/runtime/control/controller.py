@@ -13,6 +13,7 @@ from device_agent.ports.driver import Twist
 from device_agent.ports.geometry import RobotGeometry
 from device_agent.protocol import Mode, Setpoint, StopLatch
 from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.protocol.security.setpoints import SetpointKeys
 from device_agent.runtime.authority.authority import Reservation
 from device_agent.runtime.authority.event_recorder import RecordEvent, ignore_event
 from device_agent.runtime.authority.lease_gate import Lease, LeaseGate
@@ -58,7 +59,7 @@ class Controller:
     # ------------------------------------------------------------ leases, Stop, faults
 
     def grant(
-        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: tuple[bytes, ...] = ()
+        self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: SetpointKeys = ()
     ) -> None:
         """Accept a signed grant or renewal of the lease. ``keys`` authenticate its setpoints.
 

@@ -54,7 +54,8 @@ def test_setpoints_and_stop_of_a_console_reach_the_robot_over_the_broker(
             time.sleep(0.005)
         wait_until(lambda: len(robot.setpoints) >= 20, "every setpoint")
     assert {received for received, _ in robot.setpoints} == {topic}
-    received = [setpoints.open_sealed(payload, (key,), topic) for _, payload in robot.setpoints]
+    keys = (setpoints.SetpointKey(key, topic),)
+    received = [setpoints.open_sealed(payload, keys) for _, payload in robot.setpoints]
     assert [codec.decode(body, Setpoint).sequence for body in received] == list(range(1, 21))
     issued = anna.post("/mqtt/credentials", {"purpose": "view"}).json()
     with broker.connect(issued["client_id"], (issued["username"], issued["password"])) as console:  # type: ignore[arg-type]

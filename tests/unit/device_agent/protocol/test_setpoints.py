@@ -8,6 +8,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from device_agent.protocol import GrantLease, Stop, codec, fields
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import setpoints, signing
+from device_agent.protocol.security.setpoints import SetpointKey
 
 AGENT, CLOUD = signing.generate(), signing.generate()
 TOPIC = "ts/v1/s/a/arm/ctl/7"
@@ -31,10 +32,12 @@ def test_a_public_key_of_small_order_is_rejected() -> None:
 
 def test_a_sealed_body_is_opened_with_its_key_and_topic_only() -> None:
     sealed = setpoints.seal(b'{"a": 1}', key(), TOPIC)
-    assert setpoints.open_sealed(sealed, (b"other", key()), TOPIC) == b'{"a": 1}'
-    for keys, topic in (((), TOPIC), ((b"other",), TOPIC), ((key(),), "ts/v1/s/a/arm/ctl/8")):
+    other, right = SetpointKey(b"other", TOPIC), SetpointKey(key(), TOPIC)
+    for _ in range(2):  # a key can be used again
+        assert setpoints.open_sealed(sealed, (other, right)) == b'{"a": 1}'
+    for keys in ((), (other,), (SetpointKey(key(), "ts/v1/s/a/arm/ctl/8"),)):
         with pytest.raises(SignatureError):
-            setpoints.open_sealed(sealed, keys, topic)
+            setpoints.open_sealed(sealed, keys)
 
 
 def test_a_tag_has_the_documented_value() -> None:
