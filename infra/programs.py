@@ -2,7 +2,6 @@
 
 import contextlib
 import ctypes
-import math
 import shutil
 import signal
 import socket
@@ -12,9 +11,11 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
+from typing import NamedTuple
 
 ENDED, BAD_INPUT, CANNOT_START = 1, 2, 3
 """Exit codes: the server exited; a folder or address is invalid; a port is in use or the server is not installed."""
+LOOPBACK = "127.0.0.1"
 _START_S = 10.0
 _STOP_S = 1.5
 _POLL_S = 0.25
@@ -28,6 +29,22 @@ class NotInstalledError(Exception):
 
 class PortTakenError(Exception):
     """A port cannot be used."""
+
+
+class Server(NamedTuple):
+    """A server to run."""
+
+    name: str
+    """For messages."""
+    command: Sequence[str]
+    """Program and arguments."""
+    host: str
+    """The address it listens on."""
+    ports: Sequence[int]
+    folder: Path | None = None
+    """Its working directory; the server needs no access to the folders above."""
+    descriptors: Sequence[int] = ()
+    """Descriptors of this program that it inherits."""
 
 
 def find(program: str, *, package: str) -> str:
@@ -51,7 +68,7 @@ def address(host: str) -> str:
     return str(socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_STREAM)[0][4][0])
 
 
-def free_ports(host: str, *ports: int) -> list[int]:
+def free_ports(*addresses: tuple[str, int]) -> list[int]:
     """The ports, with 0 replaced by free ports. All are bound at the same time, so that two zeros give different ports.
 
     Raises:
@@ -59,7 +76,7 @@ def free_ports(host: str, *ports: int) -> list[int]:
     """
     with contextlib.ExitStack() as stack:
         sockets: list[socket.socket] = []
-        for port in ports:
+        for host, port in addresses:
             try:
                 listening_socket = stack.enter_context(socket.socket())
                 listening_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -90,47 +107,62 @@ def explain(error: Exception, *, server: str, host: str, home: Path) -> int:
 
 
 def supervise(
-    name: str,
-    command: Sequence[str],
-    *,
-    host: str,
-    ports: Sequence[int],
+    *servers: Server,
     ready: str,
     watched: Path | None = None,
     refresh: Callable[[], None] = lambda: None,
-    folder: Path | None = None,
     user: tuple[int, int] | None = None,
 ) -> int:
-    """Run a server until SIGTERM or SIGINT; print ``ready`` once it accepts connections on every port.
+    """Run servers until SIGTERM or SIGINT, or until one exits; print ``ready`` once all accept connections.
 
     Args:
-        name: For messages.
-        command: Program and arguments.
-        host: The address it listens on.
-        ports: Its ports.
+        servers: Each starts once the previous one accepts connections.
         ready: The line to print.
-        watched: A file of the server; a change sends SIGHUP to the server.
-        refresh: Called before that; an ``OSError`` is printed.
-        folder: Its working directory. The server needs no access to the folders above.
-        user: User id and group id of the server; ``None`` for those of this program.
+        watched: A file of the servers.
+        refresh: Called after each change of the file; an ``OSError`` is printed.
+        user: User id and group id of the servers; ``None`` for those of this program.
 
     Returns:
         The exit code.
     """
-    kill_at = math.inf  # a finite time after the signal that asks this program to stop
-    child: subprocess.Popen[bytes] | None = None
+    stopping = False
+    children: list[subprocess.Popen[bytes]] = []
 
     def stop(_: int, __: FrameType | None) -> None:
-        nonlocal kill_at
-        kill_at = time.monotonic() + _STOP_S
-        if child is not None:
+        nonlocal stopping
+        stopping = True
+        for child in children:
             child.terminate()
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, stop)
-    child = subprocess.Popen(  # noqa: S603 (resolved path, generated files)
-        command,
-        cwd=folder,
+    for server in servers:
+        children.append(_start(server, user))
+        if not _wait_for_ports(server, children[-1], lambda: stopping):
+            break
+    else:
+        print(ready, flush=True)  # noqa: T201 (command-line program)
+    stamp = _stamp(watched)
+    while not stopping and all(child.poll() is None for child in children):
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            children[-1].wait(_POLL_S)
+        previous, stamp = stamp, _stamp(watched)
+        if stamp != previous:
+            _refresh(refresh)
+    ended = [(server.name, child.returncode) for server, child in zip(servers, children, strict=False)]
+    _end(children)
+    if stopping:
+        return 0
+    name, code = next((name, code) for name, code in ended if code is not None)
+    print_error(f"{name} exited with code {code}; see its output above")
+    return ENDED
+
+
+def _start(server: Server, user: tuple[int, int] | None) -> "subprocess.Popen[bytes]":
+    return subprocess.Popen(  # noqa: S603 (resolved path, generated files)
+        server.command,
+        cwd=server.folder,
+        pass_fds=server.descriptors,
         user=user and user[0],
         group=user and user[1],
         extra_groups=user and [],
@@ -139,33 +171,26 @@ def supervise(
         preexec_fn=lambda: signal_with_parent(signal.SIGKILL),  # noqa: PLW1509 (single-threaded)
         start_new_session=True,  # Ctrl-C only reaches this program, which stops the server
     )
-    if kill_at < math.inf:
+
+
+def _end(children: "Sequence[subprocess.Popen[bytes]]") -> None:
+    """End the children; kill those that ignore SIGTERM."""
+    kill_at = time.monotonic() + _STOP_S
+    for child in children:
         child.terminate()
-    elif _wait_for_ports(name, child, host, ports):
-        print(ready, flush=True)  # noqa: T201 (command-line program)
-    stamp = _stamp(watched)
-    while child.poll() is None:
-        # A wait without a timeout would continue after the signal, for as long as the server ignores SIGTERM.
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(_POLL_S)
-        previous, stamp = stamp, _stamp(watched)
-        if time.monotonic() > kill_at:
+    for child in children:
+        try:
+            child.wait(max(0.0, kill_at - time.monotonic()))
+        except subprocess.TimeoutExpired:
             child.kill()
-        elif stamp != previous:
-            _reload(child, refresh)
-    if kill_at < math.inf:
-        return 0
-    print_error(f"{name} exited with code {child.returncode}; see its output above")
-    return ENDED
+            child.wait()
 
 
-def _reload(child: "subprocess.Popen[bytes]", refresh: Callable[[], None]) -> None:
+def _refresh(refresh: Callable[[], None]) -> None:
     try:
         refresh()
     except OSError as error:
         print_error(f"cannot read {error.filename}: {error.strerror}; the previous content applies")
-    else:
-        child.send_signal(signal.SIGHUP)
 
 
 def _stamp(path: Path | None) -> tuple[int, int] | None:
@@ -177,17 +202,17 @@ def _stamp(path: Path | None) -> tuple[int, int] | None:
     return stat and (stat.st_mtime_ns, stat.st_ino)
 
 
-def _wait_for_ports(name: str, child: "subprocess.Popen[bytes]", host: str, ports: Sequence[int]) -> bool:
-    """Wait until every port accepts a connection, or the server has exited."""
+def _wait_for_ports(server: Server, child: "subprocess.Popen[bytes]", stopping: Callable[[], bool]) -> bool:
+    """Wait until every port accepts a connection, the server has exited, or this program stops."""
     deadline = time.monotonic() + _START_S
-    pending = list(ports)
-    while pending and child.poll() is None:
+    pending = list(server.ports)
+    while pending and child.poll() is None and not stopping():
         try:
-            socket.create_connection((host, pending[0]), timeout=1.0).close()
+            socket.create_connection((server.host, pending[0]), timeout=1.0).close()
             del pending[0]
         except OSError:
             if time.monotonic() > deadline:
-                print_error(f"{name} does not listen on {host}:{pending[0]}")
+                print_error(f"{server.name} does not listen on {server.host}:{pending[0]}")
                 child.terminate()
                 return False
             time.sleep(0.02)

@@ -1,7 +1,7 @@
-"""``python -m infra.mosquitto``: run mosquitto until SIGTERM or SIGINT.
+"""``python -m infra.mosquitto``: run mosquitto behind HAProxy until SIGTERM or SIGINT.
 
-Prints ``ready tcp=PORT websocket=PORT`` once both listeners accept connections. Exit codes: 0 on a signal; 3 if a port
-is in use or mosquitto is not installed; 2 if the folder cannot be used; 1 if mosquitto exits. Errors print one line.
+Prints ``ready tcp=PORT websocket=PORT`` once both servers accept connections. Exit codes: 0 on a signal; 3 if a port
+is in use or a server is not installed; 2 if the folder cannot be used; 1 if a server exits. Errors print one line.
 """
 
 import argparse
@@ -12,12 +12,9 @@ from pathlib import Path
 
 from device_agent.protocol.security import private_folder
 from infra import programs
-from infra.mosquitto import broker_user, configuration
-from infra.mosquitto.configuration import Tls
+from infra.mosquitto import admission, broker_user, configuration
+from infra.mosquitto.admission import Admission, Limits, Tls
 
-_LISTENERS = 2
-_OTHER_FILES = 64
-"""Open files of mosquitto besides connections, with a reserve."""
 _MAX_CONNECTIONS = 10_000
 
 
@@ -29,43 +26,44 @@ def main() -> int:
     try:
         # On IPv6 mosquitto's WebSocket listener cannot be bound to one address.
         host = programs.address(arguments.host)
-        binary, plugin = configuration.binary(), configuration.plugin()
-        tcp_port, websocket_port = programs.free_ports(host, arguments.tcp_port, arguments.websocket_port)
+        mosquitto, plugin, haproxy = configuration.binary(), configuration.plugin(), admission.binary()
+        internal = (programs.LOOPBACK, 0)
+        ports = programs.free_ports((host, arguments.tcp_port), (host, arguments.websocket_port), internal, internal)
+        mqtt, websocket = admission.Route(ports[0], ports[2]), admission.Route(ports[1], ports[3])
+        limits = _allow_connections(arguments.max_connections)
         configuration.write(
             home,
-            host=host,
-            tcp_port=tcp_port,
-            websocket_port=websocket_port,
+            tcp_port=mqtt.internal,
+            websocket_port=websocket.internal,
             plugin_path=plugin,
-            tls=tls,
-            max_connections=_allow_connections(arguments.max_connections),
+            max_connections=limits.clients,
             user=user,
+            require_certificate=arguments.agents_ca is not None,
         )
+        gate = Admission(home, tls, user)
+        gate.write(host=host, mqtt=mqtt, websocket=websocket, limits=limits)
     except (programs.NotInstalledError, programs.PortTakenError, OSError) as error:
         return programs.explain(error, server="mosquitto", host=arguments.host, home=home)
     if user.notice:
         programs.print_error(user.notice)
     return programs.supervise(
-        "mosquitto",
-        [binary, "-c", configuration.CONFIGURATION_FILE],
-        host=host,
-        ports=(tcp_port, websocket_port),
-        ready=f"ready tcp={tcp_port} websocket={websocket_port}",
+        programs.Server(
+            "mosquitto", [mosquitto, "-c", configuration.CONFIGURATION_FILE], programs.LOOPBACK, ports[2:], folder=home
+        ),
+        gate.server(haproxy, host, ports[:2]),
+        ready=f"ready tcp={mqtt.public} websocket={websocket.public}",
         watched=arguments.revoked,
-        refresh=lambda: configuration.copy_certificates(home, tls, user),
-        folder=home,
+        refresh=gate.update_revoked,
         user=(user.uid, user.gid) if user.differs else None,
     )
 
 
-def _allow_connections(requested: int) -> int:
-    """Allow the open files for this number of connections of each listener; returns the number that is possible."""
+def _allow_connections(requested: int) -> Limits:
+    """Allow the open files for this number of clients of each listener, or for as many as possible."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    files = _LISTENERS * requested + _OTHER_FILES
-    if hard != resource.RLIM_INFINITY:
-        files = min(files, hard)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
-    return max(1, (files - _OTHER_FILES) // _LISTENERS)
+    limits = admission.limits(requested, None if hard == resource.RLIM_INFINITY else hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limits.files, hard))
+    return limits
 
 
 def _tls(arguments: argparse.Namespace) -> Tls | None:

@@ -11,7 +11,7 @@ import secrets
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from device_agent.protocol import codec
 from device_agent.protocol.security import grants, revocation
@@ -24,15 +24,10 @@ SERVICE = "service"
 CONFIGURATION_FILE = "mosquitto.conf"
 SECURITY_FILE = "dynamic-security.json"
 PASSWORD_FILE = "service.password"  # noqa: S105 (the name of a file)
-CERTIFICATE_FILE, KEY_FILE, AGENTS_CA_FILE, REVOKED_FILE = (
-    "listener.crt",
-    "listener.key",
-    "agents-ca.crt",
-    "agents.crl",
-)
-"""Copies of the TLS files: the user of the broker cannot read the originals."""
-PACKAGE = "mosquitto"
-"""Debian package of the broker and the plugin."""
+INTERNAL_FILE = "internal.pem"
+"""Certificate and key of HAProxy and mosquitto for the connections between them."""
+PACKAGES = "mosquitto haproxy"
+"""Debian packages of the broker with its plugin, and of the server in front of it."""
 
 _PLUGIN = "mosquitto_dynamic_security.so"
 _PLUGIN_FOLDERS = (
@@ -64,7 +59,7 @@ def binary() -> str:
     Raises:
         NotInstalledError: Not installed.
     """
-    return programs.find("mosquitto", package=PACKAGE)
+    return programs.find("mosquitto", package=PACKAGES)
 
 
 def plugin() -> str:
@@ -76,38 +71,27 @@ def plugin() -> str:
     for folder in _PLUGIN_FOLDERS:
         for path in sorted(Path("/").glob(f"{folder}/{_PLUGIN}")):
             return str(path)
-    raise programs.NotInstalledError(f"mosquitto's {_PLUGIN} is not installed; on Debian: apt-get install {PACKAGE}")
-
-
-class Tls(NamedTuple):
-    """TLS files of the listeners."""
-
-    certificate: Path
-    key: Path
-    agents: Path | None = None
-    """CA whose client certificates are required on TCP; browsers cannot provide them."""
-    revoked: Path | None = None
-    """Revoked client certificates; reloaded on change."""
+    raise programs.NotInstalledError(f"mosquitto's {_PLUGIN} is not installed; on Debian: apt-get install {PACKAGES}")
 
 
 def write(
     home: Path,
     *,
-    host: str,
     tcp_port: int,
     websocket_port: int,
     plugin_path: str,
     max_connections: int,
     user: BrokerUser,
-    tls: Tls | None = None,
+    require_certificate: bool,
 ) -> None:
     """Create missing files and update the configuration. The broker's user gets all files but the service password.
 
+    ``require_certificate``: only accept MQTT connections with the certificate in ``INTERNAL_FILE``.
+
     Raises:
-        OSError: ``home`` cannot be written, or a certificate cannot be read.
+        OSError: ``home`` cannot be written.
     """
     home.mkdir(parents=True, exist_ok=True, mode=0o700)
-    copy_certificates(home, tls, user)
     security = home / SECURITY_FILE
     if not security.exists():
         password = secrets.token_urlsafe(32)
@@ -122,40 +106,22 @@ def write(
     else:
         _update_security(security)
     text = configuration(
-        host=host,
         tcp_port=tcp_port,
         websocket_port=websocket_port,
         plugin_path=plugin_path,
         max_connections=max_connections,
-        tls=tls,
+        require_certificate=require_certificate,
     )
     files.write(home / CONFIGURATION_FILE, text.encode(), mode=_SECRET)
     user.own((home, home / CONFIGURATION_FILE, security, security.with_name(f"{SECURITY_FILE}.new")))
 
 
-def copy_certificates(home: Path, tls: Tls | None, user: BrokerUser) -> None:
-    """Copy the TLS files for the broker's user.
-
-    Raises:
-        OSError: A file cannot be read or written.
-    """
-    for source, name in zip(tls or (), (CERTIFICATE_FILE, KEY_FILE, AGENTS_CA_FILE, REVOKED_FILE), strict=False):
-        if source is not None:
-            files.write(home / name, source.read_bytes(), mode=_SECRET)
-            user.own([home / name])
-
-
 def configuration(
-    *, host: str, tcp_port: int, websocket_port: int, plugin_path: str, max_connections: int, tls: Tls | None = None
+    *, tcp_port: int, websocket_port: int, plugin_path: str, max_connections: int, require_certificate: bool
 ) -> str:
-    """The text of ``mosquitto.conf``; ``host`` is an IPv4 address. Paths are relative to the broker's folder."""
-    # By default the broker accepts TLS 1.2 and 1.3.
-    server_lines = [f"max_connections {max_connections}", "max_qos 1"]
-    server_lines += [] if tls is None else [f"certfile {CERTIFICATE_FILE}", f"keyfile {KEY_FILE}"]
-    client_lines = []
-    if tls is not None and tls.agents is not None:
-        client_lines = [f"cafile {AGENTS_CA_FILE}", "require_certificate true"]
-        client_lines += [f"crlfile {REVOKED_FILE}"] if tls.revoked is not None else []
+    """The text of ``mosquitto.conf``. Paths are relative to the broker's folder."""
+    tls = [f"{option} {INTERNAL_FILE}" for option in ("certfile", "keyfile", "cafile")]
+    limits = [f"max_connections {max_connections}", "max_qos 1"]
     lines = [
         "# Written by `python -m infra.mosquitto` at each start; do not edit.",
         "per_listener_settings false",
@@ -179,13 +145,15 @@ def configuration(
         "connection_messages false",
         # Only applies to a broker that is started as root, where no other user exists.
         "user root",
-        f"listener {tcp_port} {host}",
+        # Only HAProxy connects to these.
+        f"listener {tcp_port} {programs.LOOPBACK}",
         "protocol mqtt",
-        *server_lines,
-        *client_lines,
-        f"listener {websocket_port} {host}",
+        *limits,
+        # Otherwise users of this machine could connect without a client certificate.
+        *([*tls, "require_certificate true"] if require_certificate else []),
+        f"listener {websocket_port} {programs.LOOPBACK}",
         "protocol websockets",
-        *server_lines,
+        *limits,
         # Otherwise the WebSocket listener ignores its address and accepts all IPv6 connections.
         "socket_domain ipv4",
     ]

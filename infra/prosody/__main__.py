@@ -21,7 +21,7 @@ def main() -> int:
     try:
         host = programs.address(arguments.host)
         binary = configuration.binary()
-        (port,) = programs.free_ports(host, arguments.port)
+        (port,) = programs.free_ports((host, arguments.port))
         text = configuration.configuration(
             arguments.home,
             domain=arguments.domain,
@@ -35,7 +35,7 @@ def main() -> int:
     except (programs.NotInstalledError, programs.PortTakenError, OSError, configuration.ConfigurationError) as error:
         return programs.explain(error, server="Prosody", host=arguments.host, home=arguments.home)
     command = [binary, "--config", str((arguments.home / configuration.CONFIGURATION_FILE).absolute()), "-F"]
-    return programs.supervise("prosody", command, host=host, ports=(port,), ready=f"ready xmpp={port}")
+    return programs.supervise(programs.Server("prosody", command, host, (port,)), ready=f"ready xmpp={port}")
 
 
 def _arguments() -> argparse.Namespace:

@@ -21,7 +21,8 @@ from function_app.domain.common.ids import new_id
 from function_app.ports.broker_access import BrokerAccessError
 from function_app.ports.certificates import CertificateRefused
 from infra.tls import agent_ca, server_ca
-from tests.harness.network.brokers import HOST, Client, RunningBroker, start_broker, wait_until
+from tests.harness.network import raw_mqtt
+from tests.harness.network.brokers import HOST, PATIENCE_S, Client, RunningBroker, start_broker, wait_until
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +120,36 @@ def test_old_tls_versions_do_not_bypass_certificates(broker: RunningBroker, site
     context.maximum_version = ssl.TLSVersion.TLSv1_2
     with socket.create_connection((HOST, broker.tcp_port)) as plain, pytest.raises(OSError, match=r"SSL|EOF|reset"):
         context.wrap_socket(plain, server_hostname=HOST)
+
+
+def test_mosquittos_own_port_requires_the_certificate_of_haproxy(agent: Agent) -> None:
+    """Users of the same machine can connect to it."""
+    lines = (agent.broker.home / "mosquitto.conf").read_text().splitlines()
+    port = next(int(line.split()[1]) for line in lines if line.startswith("listener "))
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    client = Client(agent.name, agent.credentials, port=port, tls=context)
+    agent.broker.closers.append(client.close)
+    assert not client.open().connected.is_set()
+    plain = Client(agent.name, agent.credentials, port=port)
+    agent.broker.closers.append(plain.close)
+    assert not plain.open().connected.is_set()
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+def test_a_tls_session_cannot_be_resumed(agent: Agent, version: ssl.TLSVersion) -> None:
+    """A resumed session would not be checked against the revoked certificates."""
+    context = client_context(agent.site / "ca.crt")
+    context.load_cert_chain(*agent.certificate())
+    context.minimum_version = context.maximum_version = version
+    session = None
+    for _ in range(2):
+        plain = socket.create_connection((HOST, agent.broker.tcp_port), PATIENCE_S)
+        with context.wrap_socket(plain, server_hostname=HOST, session=session) as connection:
+            connection.sendall(raw_mqtt.connect_packet(agent.name, agent.credentials))
+            assert connection.recv(4) == raw_mqtt.packet(2, b"\0\0")
+            assert not connection.session_reused
+            session = connection.session
 
 
 # ---------------------------------------------------------------- certificate requests

@@ -5,11 +5,13 @@ import json
 import os
 import pwd
 import socket
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from tests.harness.network.brokers import HOST, RunningBroker, start_broker, wait_until
+from tests.harness.network.brokers import HOST, PATIENCE_S, RunningBroker, Transport, start_broker, wait_until
+from tests.harness.network.half_open import PARTS
 
 LIMIT = 4
 
@@ -31,11 +33,8 @@ def closed(connection: socket.socket) -> bool:
         return True
 
 
-def mosquitto_of(broker: RunningBroker) -> int:
-    """Process id of mosquitto itself."""
-    pid = broker.process.pid
-    (child,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return int(child)
+def all_closed(connections: list[socket.socket]) -> bool:
+    return all(map(closed, connections))
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can start a process of another user")
@@ -43,9 +42,10 @@ def test_started_as_root_it_runs_as_its_own_user_and_keeps_rights_of_an_earlier_
     own = pwd.getpwnam("mosquitto").pw_uid
     with start_broker("mosquitto", tmp_path) as broker:
         credentials = broker.issue(broker.grant("agent"))
-        status = Path(f"/proc/{mosquitto_of(broker)}/status").read_text()
-        assert f"Uid:\t{own}\t{own}\t{own}\t{own}\n" in status
-        assert "Groups:\t \n" in status
+        for server in broker.servers().values():
+            status = Path(f"/proc/{server}/status").read_text()
+            assert f"Uid:\t{own}\t{own}\t{own}\t{own}\n" in status
+            assert "Groups:\t \n" in status
     for path in (tmp_path, *tmp_path.iterdir()):
         os.chown(path, 0, 0)  # as an earlier version, which ran as root
     with start_broker("mosquitto", tmp_path) as broker:
@@ -60,14 +60,52 @@ def test_a_message_at_qos_2_is_not_held(tmp_path: Path) -> None:
         assert robot.ended()
 
 
-def test_connections_beyond_the_limit_are_closed_and_leave_room_afterwards(tmp_path: Path) -> None:
+def test_clients_beyond_the_limit_are_closed_and_leave_room_afterwards(tmp_path: Path) -> None:
+    with start_broker("mosquitto", tmp_path, more=("--max-connections", str(LIMIT))) as broker:
+        issued = {name: broker.issue(broker.grant(name)) for name in map(str, range(LIMIT + 2))}
+        with contextlib.ExitStack() as stack:
+            connected = [
+                stack.enter_context(broker.connect(name, credentials)).connected.is_set()
+                for name, credentials in issued.items()
+            ]
+        assert 0 < sum(connected) <= LIMIT
+        assert not connected[-1]
+        wait_until(lambda: broker.accepts("0", issued["0"]), "a free connection")
+
+
+def test_one_address_cannot_take_all_websocket_connections(tmp_path: Path) -> None:
+    request = PARTS["websockets"][-1]
+    with (
+        start_broker("mosquitto", tmp_path, more=("--max-connections", str(LIMIT))) as broker,
+        contextlib.ExitStack() as stack,
+    ):
+        for _ in range(4 * LIMIT):
+            attacker = stack.enter_context(socket.create_connection((HOST, broker.websocket_port)))
+            attacker.sendall(request)
+        other = stack.enter_context(
+            socket.create_connection((HOST, broker.websocket_port), PATIENCE_S, source_address=("127.0.0.2", 0))
+        )
+        other.sendall(request)
+        assert other.recv(12) == b"HTTP/1.1 101"
+
+
+def test_at_the_limit_connections_without_a_complete_connect_are_closed_and_a_client_connects(
+    tmp_path: Path, transport: Transport
+) -> None:
     with start_broker("mosquitto", tmp_path, more=("--max-connections", str(LIMIT))) as broker:
         credentials = broker.issue(broker.grant("robot"))
         with contextlib.ExitStack() as stack:
-            silent = [stack.enter_context(socket.create_connection((HOST, broker.tcp_port))) for _ in range(2 * LIMIT)]
-            # mosquitto 2.0.11 admits one connection more than its limit.
-            wait_until(lambda: sum(map(closed, silent)) >= LIMIT - 1, "connections to be closed")
-        wait_until(lambda: broker.accepts("robot", credentials), "a free connection")
+            for part in PARTS[transport][:2]:
+                attackers = [
+                    stack.enter_context(socket.create_connection((HOST, broker.port(transport))))
+                    for _ in range(4 * LIMIT)
+                ]
+                for attacker in attackers:
+                    attacker.sendall(part)
+                if transport == "tcp":
+                    assert broker.accepts("robot", credentials)
+                wait_until(partial(all_closed, attackers), "them to be closed")
+        assert broker.accepts("robot", credentials, transport=transport)
 
 
 def test_repeated_requests_for_credentials_keep_a_bounded_number_of_clients(tmp_path: Path) -> None:

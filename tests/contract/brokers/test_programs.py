@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from device_agent.protocol.security import signing
-from tests.harness.network.brokers import HOST, PATIENCE_S, BrokerKind, RunningBroker, start_broker, wait_until
+from tests.harness.network.brokers import HOST, PATIENCE_S, BrokerKind, start_broker, wait_until
 from tests.harness.paths import ROOT
 
 FREE_PORTS = ("--tcp-port", "0", "--websocket-port", "0")
@@ -141,22 +141,19 @@ def test_mosquittos_secrets_are_readable_by_its_owner_only(tmp_path: Path) -> No
     assert security.exists()
 
 
-def mosquitto_of(broker: RunningBroker) -> int:
-    """Process id of mosquitto itself."""
-    pid = broker.process.pid
-    (child,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return int(child)
-
-
-def test_program_and_mosquitto_end_together(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["mosquitto", "haproxy"])
+def test_program_and_servers_end_together(tmp_path: Path, name: str) -> None:
     with start_broker("mosquitto", tmp_path) as broker:
-        child = mosquitto_of(broker)
+        servers = broker.servers()
+        assert set(servers) == {"mosquitto", "haproxy"}
         broker.kill()
-        wait_until(lambda: not _runs(child), "the end of mosquitto")
+        wait_until(lambda: not any(map(_runs, servers.values())), "the end of the servers")
     with start_broker("mosquitto", tmp_path) as broker:
-        os.kill(mosquitto_of(broker), signal.SIGKILL)
+        servers = broker.servers()
+        os.kill(servers[name], signal.SIGKILL)
         assert broker.process.wait(PATIENCE_S) == 1
-        assert "exited with code" in broker.stderr()
+        assert f"{name} exited with code -9" in broker.stderr()
+        assert not any(map(_runs, servers.values()))
 
 
 def _runs(pid: int) -> bool:

@@ -5,19 +5,19 @@ from pathlib import Path
 
 import pytest
 
-from infra.mosquitto import broker_user, configuration
+from infra.mosquitto import admission, broker_user, configuration
 from infra.mosquitto.broker_user import BrokerUser
 
 
 def write(home: Path, tcp_port: int = 1) -> None:
     configuration.write(
         home,
-        host="127.0.0.1",
         tcp_port=tcp_port,
         websocket_port=2,
         plugin_path="/x.so",
         max_connections=1000,
         user=BrokerUser(os.geteuid(), os.getegid()),
+        require_certificate=False,
     )
 
 
@@ -77,6 +77,18 @@ def test_a_start_removes_expired_clients_and_keeps_others(tmp_path: Path) -> Non
     updated = json.loads(path.read_text())
     assert [client["username"] for client in updated["clients"]] == ["service", *names[1:]]
     assert [role["rolename"] for role in updated["roles"]] == ["service", *names[1:]]
+
+
+@pytest.mark.parametrize(("requested", "files"), [(10_000, 1_024), (10_000, 65_536), (10_000, 256), (4, 1_024)])
+def test_limits_of_connections_fit_the_open_files(requested: int, files: int) -> None:
+    limits = admission.limits(requested, files)
+    assert limits.files <= files
+    assert 1 <= limits.clients <= requested
+    assert limits.reserve >= 1
+
+
+def test_without_a_limit_of_open_files_all_requested_clients_are_possible() -> None:
+    assert admission.limits(100_000, None).clients == 100_000
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,9 @@ signal.signal(signal.SIGTERM, signal.SIG_IGN)
 listener = socket.create_server(("127.0.0.1", int(__import__("sys").argv[1])))
 time.sleep(600)
 '''
-(port,) = programs.free_ports("127.0.0.1", 0)
+(port,) = programs.free_ports(("127.0.0.1", 0))
 command = [sys.executable, "-c", server, str(port)]
-sys.exit(programs.supervise("server", command, host="127.0.0.1", ports=(port,), ready="ready"))
+sys.exit(programs.supervise(programs.Server("server", command, "127.0.0.1", (port,)), ready="ready"))
 """
 
 

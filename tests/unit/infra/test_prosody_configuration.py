@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from infra import programs
+from infra.mosquitto import admission
 from infra.mosquitto import configuration as mosquitto
 from infra.prosody import configuration
 from infra.prosody.configuration import ConfigurationError
@@ -49,7 +50,12 @@ def test_arguments_are_quoted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("find", "package"),
-    [(mosquitto.binary, "mosquitto"), (mosquitto.plugin, "mosquitto"), (configuration.binary, "prosody")],
+    [
+        (mosquitto.binary, "mosquitto haproxy"),
+        (mosquitto.plugin, "mosquitto haproxy"),
+        (admission.binary, "mosquitto haproxy"),
+        (configuration.binary, "prosody"),
+    ],
 )
 def test_a_missing_installation_names_the_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, find: Callable[[], object], package: str
