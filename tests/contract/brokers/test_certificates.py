@@ -122,6 +122,16 @@ def test_old_tls_versions_do_not_bypass_certificates(broker: RunningBroker, site
         context.wrap_socket(plain, server_hostname=HOST)
 
 
+def test_an_invalid_revocation_list_is_reported_and_clients_still_connect(agent: Agent) -> None:
+    path = agent.site / "devices.crl"
+    valid = path.read_bytes()
+    path.write_bytes(b"invalid")
+    wait_until(lambda: "the previous content applies" in agent.broker.stderr(), "the report")
+    path.write_bytes(valid)
+    assert agent.connect().connected.is_set()
+    assert not agent.connect(certificate=None).connected.is_set()
+
+
 def test_mosquittos_own_port_requires_the_certificate_of_haproxy(agent: Agent) -> None:
     """Users of the same machine can connect to it."""
     lines = (agent.broker.home / "mosquitto.conf").read_text().splitlines()
