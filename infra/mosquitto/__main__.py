@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 
 from device_agent.protocol.security import private_folder
-from infra import programs
-from infra.mosquitto import admission, broker_user, configuration
+from infra import programs, service_user
+from infra.mosquitto import admission, configuration
 from infra.mosquitto.admission import Admission, Limits, Tls
 
 _MAX_CONNECTIONS = 10_000
@@ -22,7 +22,7 @@ def main() -> int:
     """Run mosquitto; returns the exit code."""
     os.umask(private_folder.UMASK)
     arguments = _arguments()
-    home, user, tls = arguments.home, broker_user.choose(), _tls(arguments)
+    home, user, tls = arguments.home, service_user.choose("mosquitto"), _tls(arguments)
     try:
         # On IPv6 mosquitto's WebSocket listener cannot be bound to one address.
         host = programs.address(arguments.host)
@@ -54,7 +54,7 @@ def main() -> int:
         ready=f"ready tcp={mqtt.public} websocket={websocket.public}",
         watched=arguments.revoked,
         refresh=gate.update_revoked,
-        user=(user.uid, user.gid) if user.differs else None,
+        user=user.ids,
     )
 
 

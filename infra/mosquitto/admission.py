@@ -17,8 +17,8 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from infra import files, programs
-from infra.mosquitto.broker_user import BrokerUser
 from infra.mosquitto.configuration import INTERNAL_FILE, PACKAGES
+from infra.service_user import ServiceUser
 from infra.tls import server_ca
 
 CONFIGURATION_FILE = "haproxy.cfg"
@@ -204,7 +204,7 @@ class Admission:
         user: The broker's user.
     """
 
-    def __init__(self, home: Path, tls: Tls | None, user: BrokerUser) -> None:
+    def __init__(self, home: Path, tls: Tls | None, user: ServiceUser) -> None:
         self._home, self._tls, self._user = home, tls, user
         # HAProxy returns to its working directory by its path. The broker's user may have no access to that path.
         self._descriptor = os.open(home, os.O_RDONLY | os.O_DIRECTORY)

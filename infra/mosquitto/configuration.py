@@ -17,7 +17,7 @@ from device_agent.protocol import codec
 from device_agent.protocol.security import grants, revocation
 from function_app.adapters.local import mosquitto_clients
 from infra import files, programs
-from infra.mosquitto.broker_user import BrokerUser
+from infra.service_user import ServiceUser
 
 SERVICE = "service"
 """User name and role of the functions' client."""
@@ -81,7 +81,7 @@ def write(
     websocket_port: int,
     plugin_path: str,
     max_connections: int,
-    user: BrokerUser,
+    user: ServiceUser,
     require_certificate: bool,
 ) -> None:
     """Create missing files and update the configuration. The broker's user gets all files but the service password.

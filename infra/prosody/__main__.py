@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from device_agent.protocol.security import private_folder
-from infra import programs
+from infra import programs, service_user
 from infra.prosody import configuration
 
 
@@ -18,24 +18,28 @@ def main() -> int:
     """Run Prosody; returns the exit code."""
     os.umask(private_folder.UMASK)
     arguments = _arguments()
+    home, user = arguments.home, service_user.choose("prosody")
     try:
         host = programs.address(arguments.host)
         binary = configuration.binary()
         (port,) = programs.free_ports((host, arguments.port))
-        text = configuration.configuration(
-            arguments.home,
+        configuration.write(
+            home,
             domain=arguments.domain,
             host=host,
             port=port,
             verify_url=arguments.verify_url,
             certificate=arguments.certificate,
             key=arguments.key,
+            user=user,
         )
-        configuration.write(arguments.home, text)
     except (programs.NotInstalledError, programs.PortTakenError, OSError, configuration.ConfigurationError) as error:
-        return programs.explain(error, server="Prosody", host=arguments.host, home=arguments.home)
-    command = [binary, "--config", str((arguments.home / configuration.CONFIGURATION_FILE).absolute()), "-F"]
-    return programs.supervise(programs.Server("prosody", command, host, (port,)), ready=f"ready xmpp={port}")
+        return programs.explain(error, server="Prosody", host=arguments.host, home=home)
+    if user.notice:
+        programs.print_error(user.notice)
+    command = [binary, "--config", f"./{configuration.CONFIGURATION_FILE}", "-F"]
+    server = programs.Server("prosody", command, host, (port,), folder=home)
+    return programs.supervise(server, ready=f"ready xmpp={port}", user=user.ids)
 
 
 def _arguments() -> argparse.Namespace:

@@ -2,17 +2,22 @@
 
 import ipaddress
 import json
-import os
 import re
 from pathlib import Path
 
 from device_agent.protocol.xmpp import jids, stanzas
-from infra import programs
+from infra import files, programs
+from infra.service_user import ServiceUser
 
 CONFIGURATION_FILE = "prosody.cfg.lua"
 PACKAGE = "prosody"
-MODULES = Path(__file__).resolve().parent
-"""Folder of the project's Prosody module."""
+_MODULE = Path(__file__).with_name("mod_auth_telescope.lua")
+_CERTIFICATE_FILE, _KEY_FILE = "domain.crt", "domain.key"
+"""Copies of the TLS files: Prosody's user cannot read the originals."""
+_CERTIFICATE_FOLDER = "certs"
+"""Stays empty; Prosody warns if it is missing."""
+_SECRET = 0o600
+"""Mode of a file that only its owner may read."""
 
 _DOMAIN = re.compile(r"\A(?=.{1,253}\Z)[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*\Z")
 _RATE = "2mb/s"
@@ -32,48 +37,65 @@ def binary() -> str:
     return programs.find("prosody", package=PACKAGE)
 
 
-def write(home: Path, text: str) -> None:
-    """Write the configuration file.
-
-    Raises:
-        OSError: ``home`` cannot be written.
-    """
-    home.mkdir(parents=True, exist_ok=True, mode=0o700)
-    (home / "certs").mkdir(exist_ok=True)  # Prosody warns if its certificate folder is missing
-    path = home / CONFIGURATION_FILE
-    if not path.exists() or path.read_text() != text:
-        path.write_text(text)
-
-
-def configuration(
-    home: Path, *, domain: str, host: str, port: int, verify_url: str, certificate: Path | None, key: Path | None
-) -> str:
-    """The text of ``prosody.cfg.lua``.
+def write(
+    home: Path,
+    *,
+    domain: str,
+    host: str,
+    port: int,
+    verify_url: str,
+    certificate: Path | None,
+    key: Path | None,
+    user: ServiceUser,
+) -> None:
+    """Write the configuration, and copy the module and the TLS files for Prosody's user, who gets them.
 
     Args:
-        home: Folder for its data.
+        home: Folder for all files.
         domain: The domain of every JID.
         host: The address to listen on.
         port: Port for clients.
         verify_url: URL by which the functions authenticate clients.
         certificate: Of the domain, with its chain; required unless ``host`` is a loopback address.
         key: Its private key.
+        user: Runs Prosody.
+
+    Raises:
+        ConfigurationError: An argument is invalid.
+        OSError: ``home`` cannot be written, or a file cannot be read.
+    """
+    if (certificate is None) != (key is None):
+        raise ConfigurationError("certificate and key must be given together")
+    # Prosody makes paths absolute, but its user has no access to the folders above. This link does not need it (Linux).
+    folder = Path("/proc/self/cwd") if user.differs else home.absolute()
+    encrypted = certificate is not None
+    text = configuration(folder, domain=domain, host=host, port=port, verify_url=verify_url, encrypted=encrypted)
+    home.mkdir(parents=True, exist_ok=True, mode=0o700)
+    (home / _CERTIFICATE_FOLDER).mkdir(exist_ok=True)
+    contents = {CONFIGURATION_FILE: text.encode(), _MODULE.name: _MODULE.read_bytes()}
+    if certificate is not None and key is not None:
+        contents |= {_CERTIFICATE_FILE: certificate.read_bytes(), _KEY_FILE: key.read_bytes()}
+    for name, content in contents.items():
+        files.write(home / name, content, mode=_SECRET)
+    user.own([home, home / _CERTIFICATE_FOLDER, *(home / name for name in contents)])
+
+
+def configuration(folder: Path, *, domain: str, host: str, port: int, verify_url: str, encrypted: bool) -> str:
+    """The text of ``prosody.cfg.lua`` in ``folder``; see ``write`` for the other arguments.
 
     Raises:
         ConfigurationError: An argument is invalid.
     """
     if not _DOMAIN.match(domain):
         raise ConfigurationError(f"'{domain[:80]}' is not a valid domain in lower case")
-    if (certificate is None) != (key is None):
-        raise ConfigurationError("certificate and key must be given together")
-    if certificate is None and not ipaddress.ip_address(host).is_loopback:
+    if not encrypted and not ipaddress.ip_address(host).is_loopback:
         raise ConfigurationError(f"without a certificate Prosody must listen on loopback, not on {host}")
-    encrypted = certificate is not None
     modules = ["roster", "saslauth", "ping", "disco", "limits", *(["tls"] if encrypted else [])]
     lines = [
         "-- Written by `python -m infra.prosody` at each start; do not edit.",
-        f"data_path = {_lua(home.absolute())}",
-        f"plugin_paths = {{ {_lua(MODULES)} }}",
+        f"data_path = {_lua(folder)}",
+        f"plugin_paths = {{ {_lua(folder)} }}",
+        f"certificates = {_lua(folder / _CERTIFICATE_FOLDER)}",
         'log = { warn = "*console" }',
         "-- Nagle's algorithm costs 44 ms for each small message. The module decides about silent clients.",
         f"network_settings = {{ nagle = false, read_timeout = {stanzas.TIMEOUT_S:g} }}",
@@ -90,13 +112,14 @@ def configuration(
         f"c2s_stanza_size_limit = {stanzas.MAX_STANZA_BYTES}",
         f'limits = {{ c2s = {{ rate = "{_RATE}", burst = "2s" }} }}',
         f"unlimited_jids = {{ {_lua(f'{jids.CLOUD}@{domain}')} }}",
-        *(["run_as_root = true"] if os.geteuid() == 0 else []),
+        # Only applies where no other user exists.
+        "run_as_root = true",
         f"VirtualHost {_lua(domain)}",
         'authentication = "telescope"',
         f"telescope_verify_url = {_lua(verify_url)}",
     ]
-    if certificate is not None and key is not None:
-        lines.append(f"ssl = {{ certificate = {_lua(certificate.absolute())}, key = {_lua(key.absolute())} }}")
+    if encrypted:
+        lines.append(f"ssl = {{ certificate = {_lua(folder / _CERTIFICATE_FILE)}, key = {_lua(folder / _KEY_FILE)} }}")
     return "\n".join(lines) + "\n"
 
 

@@ -1,12 +1,11 @@
 import json
 import os
-import pwd
 from pathlib import Path
 
 import pytest
 
-from infra.mosquitto import admission, broker_user, configuration
-from infra.mosquitto.broker_user import BrokerUser
+from infra.mosquitto import admission, configuration
+from infra.service_user import ServiceUser
 
 
 def write(home: Path, tcp_port: int = 1) -> None:
@@ -16,7 +15,7 @@ def write(home: Path, tcp_port: int = 1) -> None:
         websocket_port=2,
         plugin_path="/x.so",
         max_connections=1000,
-        user=BrokerUser(os.geteuid(), os.getegid()),
+        user=ServiceUser(os.geteuid(), os.getegid()),
         require_certificate=False,
     )
 
@@ -89,28 +88,3 @@ def test_limits_of_connections_fit_the_open_files(requested: int, files: int) ->
 
 def test_without_a_limit_of_open_files_all_requested_clients_are_possible() -> None:
     assert admission.limits(100_000, None).clients == 100_000
-
-
-@pytest.mark.parametrize(
-    ("users", "uid", "notice"),
-    [
-        ({"mosquitto": 103}, 103, ""),
-        ({}, 65_534, "no user 'mosquitto' exists"),
-        ({"mosquitto": 103}, 0, "this container has no other user"),
-    ],
-)
-def test_root_runs_the_broker_as_a_user_without_rights(
-    users: dict[str, int], uid: int, notice: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def find(name: str) -> pwd.struct_passwd:
-        return pwd.struct_passwd((name, "x", users[name], 106, "", "/", "/bin/false"))
-
-    uid_map = tmp_path / "uid_map"
-    uid_map.write_text("0 1000 1\n" if "container" in notice else "0 0 4294967295\n")
-    monkeypatch.setattr(broker_user, "_UID_MAP", uid_map)
-    monkeypatch.setattr(pwd, "getpwnam", find)
-    monkeypatch.setattr(os, "geteuid", lambda: 0)
-    chosen = broker_user.choose()
-    assert chosen.uid == uid
-    assert notice in chosen.notice
-    assert bool(notice) == bool(chosen.notice)

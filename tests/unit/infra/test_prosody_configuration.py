@@ -1,3 +1,4 @@
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from infra.mosquitto import admission
 from infra.mosquitto import configuration as mosquitto
 from infra.prosody import configuration
 from infra.prosody.configuration import ConfigurationError
+from infra.service_user import ServiceUser
 
 
 def text(tmp_path: Path, **changes: Any) -> str:
@@ -19,12 +21,16 @@ def text(tmp_path: Path, **changes: Any) -> str:
         "verify_url": "http://127.0.0.1:8080/api/v1/xmpp/verify",
         "certificate": None,
         "key": None,
+        "user": ServiceUser(os.geteuid(), os.getegid()),
     }
-    return configuration.configuration(tmp_path, **{**defaults, **changes})
+    configuration.write(tmp_path, **{**defaults, **changes})
+    return (tmp_path / configuration.CONFIGURATION_FILE).read_text()
 
 
 def test_encryption_is_required_except_on_loopback(tmp_path: Path) -> None:
     assert "c2s_require_encryption = false" in text(tmp_path)
+    for name in ("c.pem", "k.pem"):
+        (tmp_path / name).touch()
     secure = text(tmp_path, host="192.168.1.5", certificate=tmp_path / "c.pem", key=tmp_path / "k.pem")
     assert "c2s_require_encryption = true" in secure
     assert "allow_unencrypted_plain_auth = false" in secure

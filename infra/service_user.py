@@ -1,4 +1,4 @@
-"""The user that runs mosquitto, and files that this user may read."""
+"""The user that runs a third-party server, and files that this user may read."""
 
 import os
 import pwd
@@ -6,14 +6,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-_PACKAGE_USER = "mosquitto"
 _OVERFLOW_UID = 65_534
 """The kernel's user without rights."""
 _UID_MAP = Path("/proc/self/uid_map")
 
 
-class BrokerUser(NamedTuple):
-    """The user that runs mosquitto.
+class ServiceUser(NamedTuple):
+    """The user that runs a server.
 
     Attributes:
         uid: User id.
@@ -26,8 +25,13 @@ class BrokerUser(NamedTuple):
     notice: str = ""
 
     @property
+    def ids(self) -> tuple[int, int] | None:
+        """User id and group id, or ``None`` if they are those of this program."""
+        return (self.uid, self.gid) if self.differs else None
+
+    @property
     def differs(self) -> bool:
-        """Whether mosquitto runs as another user than this program."""
+        """Whether the server runs as another user than this program."""
         return self.uid != os.geteuid()
 
     def own(self, paths: Iterable[Path]) -> None:
@@ -41,22 +45,26 @@ class BrokerUser(NamedTuple):
                 os.chown(path, self.uid, self.gid, follow_symlinks=False)
 
 
-def choose() -> BrokerUser:
-    """The user for mosquitto: a user without rights if this program runs as root, otherwise the current user."""
-    current = BrokerUser(os.geteuid(), os.getegid())
+def choose(name: str) -> ServiceUser:
+    """The user for a server: a user without rights if this program runs as root, otherwise the current user.
+
+    Args:
+        name: Of the server and of the user that its package creates.
+    """
+    current = ServiceUser(os.geteuid(), os.getegid())
     if current.uid != 0:
         return current
     try:
-        entry = pwd.getpwnam(_PACKAGE_USER)
-        chosen = BrokerUser(entry.pw_uid, entry.pw_gid)
+        entry = pwd.getpwnam(name)
+        chosen = ServiceUser(entry.pw_uid, entry.pw_gid)
     except KeyError:
         notice = (
-            f"no user '{_PACKAGE_USER}' exists; mosquitto runs with the user id {_OVERFLOW_UID}, which other services "
-            f"may use, too. Create one: adduser --system --group {_PACKAGE_USER}"
+            f"no user '{name}' exists; {name} runs with the user id {_OVERFLOW_UID}, which other services "
+            f"may use, too. Create one: adduser --system --group {name}"
         )
-        chosen = BrokerUser(_OVERFLOW_UID, _OVERFLOW_UID, notice)
+        chosen = ServiceUser(_OVERFLOW_UID, _OVERFLOW_UID, notice)
     if not _exists_here(chosen.uid):
-        return current._replace(notice="this container has no other user, so mosquitto runs as the current one")
+        return current._replace(notice=f"this container has no other user, so {name} runs as the current one")
     return chosen
 
 
