@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from device_agent import bootstrap, drivers
-from device_agent.cli import claim_prompt, systemd
+from device_agent.cli import claim_prompt, robot_types, systemd
 from device_agent.cli.arguments import Commands, add_home, add_no_qr
 from device_agent.config import catalogue
 from device_agent.config.agent_config import AgentConfig, DeviceEntry, HttpPolling
@@ -108,6 +108,8 @@ def _enroll(options: argparse.Namespace) -> int:
     claim = announce(api, config, qr=not options.no_qr)
     if not (options.no_wait and claim.code is not None):
         await_claim(store, api, config, claim, qr=not options.no_qr)
+        # Only the claim tells whose robot types apply, so a misspelled type is reported here.
+        robot_types.update(store)
     return 0
 
 
@@ -160,7 +162,7 @@ def _device(text: str) -> DeviceEntry:
         raise ConfigError(f"'{robot_type}' is not a robot type; known: {', '.join(known)}")
     if robot_type not in known:
         print(
-            f"robot type '{robot_type}' is not on this machine (known: {', '.join(known)}); `run` downloads it from "
+            f"robot type '{robot_type}' is not on this machine (known: {', '.join(known)}); it is downloaded from "
             "the account that redeems the claim code",
             flush=True,
         )

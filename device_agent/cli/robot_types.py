@@ -52,8 +52,9 @@ def _download(api: CloudClient, config: AgentConfig, types: RobotTypeStore, agen
         if types.version(name):
             _log.warning("robot type '%s' is not updated: %s", name, error)
         elif isinstance(error, ConfigError) or (isinstance(error, CloudError) and not error.passing):
+            known = ", ".join(catalogue.TYPES.folders())
             raise ConfigError(
-                f"robot type '{name}' is not on this machine, and cannot be downloaded: {error}"
+                f"robot type '{name}' is not on this machine (known: {known}), and cannot be downloaded: {error}"
             ) from error
         else:
             print(f"waiting for the cloud to download robot type {name}: {error}", flush=True)

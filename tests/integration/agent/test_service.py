@@ -146,6 +146,18 @@ class ServiceManager:
         self._socket.close()
 
 
+def test_enroll_reports_a_type_that_the_account_does_not_have_and_accepts_a_corrected_one(
+    processes: CloudProcesses, folder: Path
+) -> None:
+    enroll(processes, folder)
+    again = program(folder, "-m", "device_agent", "enroll", "--device", "arm=ur99")
+    assert again.returncode == 1
+    (line,) = [line for line in again.stderr.splitlines() if line.startswith("telescope agent:")]
+    assert "robot type 'ur99' is not on this machine (known: " in line
+    assert "ur5" in line
+    assert program(folder, "-m", "device_agent", "enroll", "--device", "arm=ur5").returncode == 0
+
+
 def test_the_service_runs_unprivileged_and_ends_on_a_signal(processes: CloudProcesses, folder: Path) -> None:
     device = enroll(processes, folder, "--transport", "http")
     home, notify = folder / "agent", folder / "notify"

@@ -87,5 +87,5 @@ def test_a_missing_type_is_downloaded_and_updated_at_each_start(cloud: MemoryClo
 
 def test_a_type_that_the_account_does_not_have_is_an_error(cloud: MemoryCloud, store: IdentityStore) -> None:
     cloud.errors = [CloudError("There is no robot type 'lever'.", "robot-type-unknown")]
-    with pytest.raises(ConfigError, match="'lever' is not on this machine, and cannot be downloaded: There is no"):
+    with pytest.raises(ConfigError, match=r"'lever' is not on this machine \(known: .*ur5.*\), and .*: There is no"):
         robot_types.update(store)
