@@ -171,13 +171,18 @@ def test_the_head_shows_an_expression_and_says_a_sentence(browser: Browser, labo
         expect(page.get_by_test_id("action-status")).to_contain_text("Good morning.")
         assert_good_page(page, "head")
 
-        # A user with control in another tab needs no request here: the action runs under the same session's lease.
+        # A lease belongs to the session (decision 0008). Another tab of it sends actions under the same epoch, without
+        # a new lease, so the first tab keeps control.
         page.get_by_test_id("take-control").click()
         expect(page.get_by_test_id("control-state")).to_have_attribute("data-state", "mine")
         expect(other.get_by_test_id("control-state")).to_have_text("You have control in another tab")
         assert other.get_by_test_id("say-text").input_value() == "This waits."
-        press(other, "say")
-        assert_done(other, "say", seen="state")
+        with laboratory.api() as api:
+            epoch = api.device("hanson")["lease"]["epoch"]
+            press(other, "say")
+            assert_done(other, "say", seen="state")
+            assert api.device("hanson")["lease"]["epoch"] == epoch
+        expect(other.get_by_test_id("control-state")).to_have_text("You have control in another tab")
         expect(page.get_by_test_id("control-state")).to_have_attribute("data-state", "mine")
         page.get_by_test_id("release-control").click()
         press(page, "expression-neutral")
