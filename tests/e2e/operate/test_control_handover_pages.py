@@ -117,3 +117,15 @@ def test_an_unanswered_request_does_not_take_control(two: tuple[Page, Page]) -> 
     expect(carol.get_by_test_id("control-request")).to_contain_text("did not respond in time")
     expect(demo.get_by_test_id("accept-request")).to_have_count(0)
     demo.get_by_test_id("release-control").click()
+
+
+def test_the_device_list_shows_the_short_id_of_the_operator(two: tuple[Page, Page], machine: Machine) -> None:
+    demo, carol = two
+    take_control(carol)
+    with machine.api("carol") as api:
+        short_id = f"#{api.get('/accounts/me')['id'][:6]}"
+    demo.goto(f"{machine.url}/#/")
+    row = demo.locator("[data-testid=device-row][data-device$='-ur5']")
+    expect(row).to_contain_text(f"carol {short_id}")
+    assert_good_page(demo, "device-list-operator")
+    release_control(carol)

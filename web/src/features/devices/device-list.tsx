@@ -5,6 +5,7 @@ import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
 import { isRoomDevice } from "./model/filter";
 import { common } from "../../shared/i18n/common";
+import { accountLabel } from "../../shared/lib/account-label";
 import { format } from "../../shared/i18n/format";
 import { MultiRobotCheckbox } from "./selection";
 import { texts } from "./texts";
@@ -128,5 +129,5 @@ function nameOf(action: { name?: string; kind: string }): string {
 function Holder({ device }: { device: DeviceStore }) {
   const holder = device.holder.value;
   if (holder === null) return <>{texts.list.noOperator}</>;
-  return <>{holder.mine ? texts.list.you : holder.name}</>;
+  return <>{holder.mine ? texts.list.you : accountLabel(holder.name, holder.account)}</>;
 }
