@@ -114,7 +114,9 @@ def test_a_warming_joint_is_reported_before_its_limit(cloud: Cloud, anna: Person
         at_c += 0.5
         assert at_c < 70, "a forecast before the warning limit"
         shown = field(anna, robot, "temperature_c.elbow")
-    assert shown["limit_earliest_s"] < (80 - at_c) / 0.5 * 60 < shown["limit_latest_s"]
+    remaining_s = (80 - at_c) / 0.5 * 60
+    assert shown["limit_earliest_s"] < remaining_s < shown["limit_latest_s"]
+    assert shown["limit_latest_s"] <= 4 * shown["limit_earliest_s"], "the widest interval that is published"
     assert field(anna, robot, "temperature_c.wrist_1")["findings"] == []
     assert health(cloud, anna, robot) == "warning"
     assert anna.post(f"/devices/{robot.device}/faults/{fault['id']}/acknowledge").json()["state"] == "acknowledged"
