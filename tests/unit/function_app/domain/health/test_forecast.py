@@ -100,6 +100,8 @@ def test_forecast_intervals_cover_the_time_and_predict_limits_of_generated_profi
     for seed in range(first, first + profiles):
         given = profile(seed)
         published = forecasts(given, seed)
+        # An interval without a bound covers every limit, but is useless.
+        assert all(each.latest_s <= max(4 * each.earliest_s, each.earliest_s + 300) for each in published)
         limit_s = math.inf if given.limit_s is None else given.limit_s
         hits = [each.earliest_s <= limit_s - each.at_s <= each.latest_s for each in published]
         if hits:
