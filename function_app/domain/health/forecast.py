@@ -28,7 +28,7 @@ _EARLIER = 0.93
 """Factor of the earliest time, for rises that become faster."""
 _STEADY = 0.15
 """A slope may decrease by this share from one half of its window to the other and still count as constant."""
-_WIDEST, _SLACK_S = 4.0, 300.0
+_WIDEST, _SLACK_S = 4.0, 200.0
 """The latest time is at most this multiple of the earliest one, or this much later [s]."""
 
 

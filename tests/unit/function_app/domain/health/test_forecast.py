@@ -88,8 +88,8 @@ def forecasts(given: Profile, seed: int) -> list[Published]:
     return published
 
 
-# The constants were chosen with the sets 0 to 6. The sets 21 to 45 were generated afterwards and used only to check.
-SETS = (0, 5, 21, 26, 27, 41, 42, 43, 44, 45)
+# The constants were chosen with the sets 0 to 6 and compared on 21 to 45. The sets 51 to 54 were used only to check.
+SETS = (0, 5, 21, 26, 41, 43, 51, 52, 53, 54)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_forecast_intervals_cover_the_time_and_predict_limits_of_generated_profi
         given = profile(seed)
         published = forecasts(given, seed)
         # An interval without a bound covers every limit, but is useless.
-        assert all(each.latest_s <= max(4 * each.earliest_s, each.earliest_s + 300) for each in published)
+        assert all(each.latest_s <= max(4 * each.earliest_s, each.earliest_s + 200) for each in published)
         limit_s = math.inf if given.limit_s is None else given.limit_s
         hits = [each.earliest_s <= limit_s - each.at_s <= each.latest_s for each in published]
         if hits:
