@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.harness.network.brokers import HOST, PATIENCE_S, RunningBroker, Transport, start_broker, wait_until
+from tests.harness.network.child_processes import child_processes
 from tests.harness.network.half_open import PARTS
 
 LIMIT = 4
@@ -42,7 +43,7 @@ def test_started_as_root_it_runs_as_its_own_user_and_keeps_rights_of_an_earlier_
     own = pwd.getpwnam("mosquitto").pw_uid
     with start_broker("mosquitto", tmp_path) as broker:
         credentials = broker.issue(broker.grant("agent"))
-        for server in broker.servers().values():
+        for server in child_processes(broker.process.pid).values():
             status = Path(f"/proc/{server}/status").read_text()
             assert f"Uid:\t{own}\t{own}\t{own}\t{own}\n" in status
             assert "Groups:\t \n" in status

@@ -13,6 +13,7 @@ import pytest
 
 from device_agent.protocol.security import signing
 from tests.harness.network.brokers import HOST, PATIENCE_S, BrokerKind, start_broker, wait_until
+from tests.harness.network.child_processes import child_processes
 from tests.harness.paths import ROOT
 
 FREE_PORTS = ("--tcp-port", "0", "--websocket-port", "0")
@@ -144,12 +145,12 @@ def test_mosquittos_secrets_are_readable_by_its_owner_only(tmp_path: Path) -> No
 @pytest.mark.parametrize("name", ["mosquitto", "haproxy"])
 def test_program_and_servers_end_together(tmp_path: Path, name: str) -> None:
     with start_broker("mosquitto", tmp_path) as broker:
-        servers = broker.servers()
+        servers = child_processes(broker.process.pid)
         assert set(servers) == {"mosquitto", "haproxy"}
         broker.kill()
         wait_until(lambda: not any(map(_runs, servers.values())), "the end of the servers")
     with start_broker("mosquitto", tmp_path) as broker:
-        servers = broker.servers()
+        servers = child_processes(broker.process.pid)
         os.kill(servers[name], signal.SIGKILL)
         assert broker.process.wait(PATIENCE_S) == 1
         assert f"{name} exited with code -9" in broker.stderr()

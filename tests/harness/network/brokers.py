@@ -278,12 +278,6 @@ class RunningBroker:
     def stderr(self) -> str:
         return (self.home / "broker.stderr").read_text()
 
-    def servers(self) -> dict[str, int]:
-        """Process ids of the servers that the broker's program runs."""
-        pid = self.process.pid
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-        return {Path(f"/proc/{child}/comm").read_text().strip(): int(child) for child in children}
-
     def stop(self) -> int:
         """Stop the broker by SIGTERM; returns its exit code."""
         self.process.terminate()
