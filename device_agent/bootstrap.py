@@ -329,15 +329,8 @@ def _outbox(
         store.outbox, own=own, max_bytes=round(buffer.max_mb * 1e6), max_age_ms=round(buffer.max_age_h * 3_600_000)
     )
     device_topic = own + configuration.devices[0].name
-    # The other transports acknowledge a message once it is stored.
-    settle_s = buffer.settle_s if configuration.transport == "mqtt" else 0.0
     return Outbox(
-        outbox_store,
-        publish=publish,
-        device_topic=device_topic,
-        is_quiet=quiet,
-        keep_hz=buffer.measurements_hz,
-        settle_s=settle_s,
+        outbox_store, publish=publish, device_topic=device_topic, is_quiet=quiet, keep_hz=buffer.measurements_hz
     )
 
 

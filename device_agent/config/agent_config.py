@@ -71,14 +71,11 @@ class Buffer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         max_mb: Size limit [MB]. The oldest entries are dropped first.
         max_age_h: Age limit of measurements [h]. The cloud rejects measurements older than one day.
         measurements_hz: Stored measurements per stream [Hz].
-        settle_s: Delay between an MQTT connection and the first stored message [s]. The cloud's worker may have lost
-            the same broker and may still be reconnecting.
     """
 
     max_mb: Annotated[float, Meta(ge=1, le=10_000)] = 64
     max_age_h: Annotated[float, Meta(gt=0, le=720)] = 24
     measurements_hz: Annotated[float, Meta(ge=0.01, le=20)] = 1
-    settle_s: Annotated[float, Meta(ge=0, le=600)] = 8
 
 
 class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -37,7 +37,9 @@ class Transport(Protocol):
             payload: The encoded message.
             qos: 0 or 1.
             retain: Whether the broker retains it for later subscribers.
-            delivered: With ``qos`` 1, called once the peer has acknowledged the message; never if that is unknown.
+            delivered: With ``qos`` 1, called once the cloud has stored the message or rejects it permanently; never if
+                that is unknown. Over MQTT, the broker's acknowledgement counts for state, description and presence,
+                and for servers that do not confirm storage. The caller repeats messages that must not be lost.
 
         Returns:
             False if the message was dropped: the link is down, its queue is full, or a frame of the same camera is

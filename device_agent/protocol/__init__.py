@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from device_agent.protocol.acks import Ack, AckStatus, Reason
+from device_agent.protocol.acks import Ack, AckStatus, Reason, Stored
 from device_agent.protocol.commands import (
     KINDS,
     LANGUAGE_PATTERN,
@@ -86,13 +86,14 @@ __all__ = [
     "LeaseState", "LookAt", "Measurements", "Mode", "MoveJoints", "MovePose", "OpenRequest", "Pose", "Presence",
     "Quaternion", "Reason", "ReleaseLease", "Request", "RequestControl", "ResetStop", "Restriction", "RobotTask",
     "RoomTask", "RotateKey", "RunBehaviour", "RunMovement", "Say", "SetControl", "SetStiffness", "Setpoint", "State",
-    "Stop", "StopDevice", "StopLatch", "Stream", "TakePicture", "TakePosture", "Task", "Text", "Twin", "TwinJoint",
-    "Vector3", "VersionRange", "WithdrawRequest", "common_version", "incompatibility", "schema_components",
+    "Stop", "StopDevice", "StopLatch", "Stored", "Stream", "TakePicture", "TakePosture", "Task", "Text", "Twin",
+    "TwinJoint", "Vector3", "VersionRange", "WithdrawRequest", "common_version", "incompatibility", "schema_components",
 ]  # fmt: skip
 
 
 def schema_components() -> tuple[dict[str, Any], dict[str, Any]]:
     """JSON Schema of every message: references by name, and definitions."""
-    kinds = (Presence, Description, Twin, State, JointTelemetry, Measurements, Event, Ack, Command, Setpoint, Stop)
+    reports = (Presence, Description, Twin, State, JointTelemetry, Measurements, Event, Ack)
+    kinds = (*reports, Stored, Command, Setpoint, Stop)
     references, definitions = msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")
     return dict(zip((kind.__name__ for kind in kinds), references, strict=True)), definitions

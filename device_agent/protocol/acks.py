@@ -1,9 +1,13 @@
-"""Acknowledgements of commands. Readers ignore unknown fields, so an older console can read a newer agent."""
+"""Acknowledgements of commands by devices, and of stored messages by the cloud.
 
+Readers ignore unknown fields, so an older console can read a newer agent.
+"""
+
+import hashlib
 from enum import StrEnum
-from typing import Any
+from typing import Annotated, Any
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from device_agent.protocol.fields import Count, Id, Label, Milliseconds, Text
 
@@ -47,3 +51,19 @@ class Ack(Struct, frozen=True, kw_only=True):
     progress: float | None = None
     output: Text = ""
     result: dict[str, Any] = {}
+
+
+MessageId = Annotated[str, Meta(pattern="^[0-9a-f]{24}$", description="BLAKE2b of topic + line feed + payload")]
+MAX_IDS = 1000
+"""Maximum number of ids in one ``Stored`` message: 27 KB."""
+
+
+class Stored(Struct, frozen=True, kw_only=True):
+    """``stored``: messages of a device that the cloud has stored, or will never accept."""
+
+    ids: Annotated[tuple[MessageId, ...], Meta(min_length=1, max_length=MAX_IDS)]
+
+
+def message_id(topic: str, payload: bytes) -> str:
+    """The id of a message: both sides compute it from the exact bytes, so it needs no field and no parsing."""
+    return hashlib.blake2b(topic.encode() + b"\n" + payload, digest_size=12).hexdigest()

@@ -24,8 +24,11 @@ CMD = "cmd"
 ACK = "ack"
 CTL = "ctl"
 STOP = "stop"
+STORED = "stored"
 
-CLASSES = frozenset({DESC, STATE, TELE, LATE, CAM, EVENT, CMD, ACK, CTL, STOP})
+CLASSES = frozenset({DESC, STATE, TELE, LATE, CAM, EVENT, CMD, ACK, CTL, STOP, STORED})
+CONFIRMED = frozenset({ACK, EVENT, LATE})
+"""Classes whose messages the cloud confirms under ``STORED``. An agent repeats them until then."""
 MEASURED = frozenset({TELE, LATE})
 """Classes that carry measurements: live, and delayed by a disconnection."""
 _NAME_REQUIRED = frozenset({TELE, LATE, CAM, CTL})

@@ -5,6 +5,7 @@ from functools import cached_property
 from function_app.bootstrap.health import HealthServices
 from function_app.services.messaging.broker_relay import BrokerRelay
 from function_app.services.messaging.command_sender import CommandSender
+from function_app.services.messaging.confirmations import Confirmations
 from function_app.services.messaging.delivery import Delivery
 from function_app.services.messaging.key_announcer import KeyAnnouncer
 from function_app.services.messaging.mailbox import Mailbox
@@ -23,6 +24,10 @@ class MessagingServices(HealthServices):
     @cached_property
     def relay(self) -> BrokerRelay:
         return BrokerRelay(bus=self.bus, clock=self.clock)
+
+    @cached_property
+    def confirmations(self) -> Confirmations:
+        return Confirmations(relay=self.relay)
 
     @cached_property
     def delivery(self) -> Delivery:

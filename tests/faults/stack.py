@@ -116,7 +116,7 @@ class Stack:
         self.broker = self._child("broker", MODULES[self._kind], *ports, *(keys if self._kind == "amqtt" else folder))
         self.broker.wait_for_line("ready", PATIENCE_S)
         self.functions = self._child("functions", "function_app", "serve")
-        self._child("worker", "function_app", "work")
+        self.worker = self.start_worker("worker")
         self.api = f"http://{HOST}:{self.port}/api/v1"
         self.http = self._closing.enter_context(httpx.Client(base_url=self.api, timeout=15))
         self.await_health()
@@ -211,6 +211,10 @@ class Stack:
         for process in (self.pid(child), *descendants):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process, number)
+
+    def start_worker(self, name: str) -> SupervisedProcess:
+        """Start another ingest worker."""
+        return self._child(name, "function_app", "work")
 
     def restart(self, child: SupervisedProcess) -> None:
         """Restart a killed program after its child processes have released their ports."""

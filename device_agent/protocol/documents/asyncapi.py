@@ -69,6 +69,15 @@ _CHANNELS = (
     _Channel("ack", f"{_DEVICE}/ack", "Ack", 1, False, "The response to one command."),
     _Channel("command", f"{_DEVICE}/cmd", "Signed", 1, False, "A signed request; `body` is a Command.", to_agent=True),
     _Channel(
+        "stored",
+        f"{_DEVICE}/stored",
+        "Stored",
+        0,
+        False,
+        "Acks, events and late measurements that are stored or rejected. The agent repeats them until then.",
+        to_agent=True,
+    ),
+    _Channel(
         "setpoint",
         f"{_DEVICE}/ctl/{{epoch}}",
         "Tagged",

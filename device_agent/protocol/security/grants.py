@@ -29,8 +29,13 @@ SERVICE_SUBSCRIBE = (
 )
 """Topics to which the functions subscribe: all messages of agents but setpoints and camera frames."""
 _COMMANDS = (f"{_EVERY_DEVICE}/{topics.CMD}", f"{_EVERY_DEVICE}/{topics.STOP}/+")
-SERVICE_PUBLISH = (*_COMMANDS, *SERVICE_SUBSCRIBE, revocation.TOPIC)
-"""Topics to which the functions publish: commands, and messages of agents that use HTTP."""
+SERVICE_PUBLISH = (
+    *_COMMANDS,
+    f"{_EVERY_DEVICE}/{topics.STORED}",
+    *(pattern for pattern in SERVICE_SUBSCRIBE if f"/{topics.LATE}/" not in pattern),
+    revocation.TOPIC,
+)
+"""Topics to which the functions publish: commands, confirmations, and live messages of agents that use HTTP."""
 
 
 class Grant(Struct, frozen=True, kw_only=True):
@@ -142,6 +147,11 @@ def agent_command_topics(space: str, agent: str) -> tuple[str, ...]:
     return (f"{own}/{topics.CMD}", f"{own}/{topics.CTL}/+", f"{own}/{topics.STOP}/+")
 
 
+def agent_confirmations(space: str, agent: str) -> str:
+    """Topics on which an agent receives confirmations of stored messages."""
+    return topics.device(space, agent, topics.ANY, topics.STORED)
+
+
 def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> Grant:
     """Grant of an agent: publish for its devices, receive their commands, and read the measurements of its space."""
     own = f"{topics.ROOT}/{space}/{agent}"
@@ -155,6 +165,7 @@ def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> 
         ),
         subscribe=(
             *agent_command_topics(space, agent),
+            agent_confirmations(space, agent),
             topics.device(space, topics.ANY, topics.ANY, topics.TELE, topics.ANY),
         ),
         token_id=token_id,

@@ -121,7 +121,6 @@ class CommandProcessor:
 
     def on_connected(self) -> None:
         """Publish the description, state and unacknowledged acks soon: the link is up."""
-        self._publisher.on_connected()
         self._connected.set()
 
     def _run(self) -> None:
@@ -130,7 +129,13 @@ class CommandProcessor:
                 payload = self._commands.get(timeout=_CONFIRM_S if self._pending_stops else _IDLE_S)
                 self._guarded(partial(self._process, payload))
             # Guarded separately: with a full disk, state and events are still published.
-            for step in (self._write_journal, self._confirm_stops, self._publish_state, self._publish_events):
+            for step in (
+                self._write_journal,
+                self._confirm_stops,
+                self._publish_state,
+                self._publisher.repeat_acks,
+                self._publish_events,
+            ):
                 self._guarded(step)
         self._guarded(self._write_journal)
         self._guarded(partial(self._publish_events, last=True))

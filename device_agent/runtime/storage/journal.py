@@ -137,11 +137,21 @@ class Journal:
                     "UPDATE commands SET delivered = 1 WHERE id = ? AND last_ack = ?", (ack.id, codec.encode(ack))
                 )
 
-    def undelivered(self, device: str) -> tuple[Ack, ...]:
-        """The last acks of this device's commands that may not have been delivered."""
+    def undelivered(self, device: str, *, after: int = 0, limit: int = -1) -> dict[int, Ack]:
+        """The last acks of this device's commands that may not have been delivered: number of the row → ack.
+
+        Args:
+            device: Name of the device.
+            after: Only rows with a higher number, in order.
+            limit: Maximum number of rows; -1: all.
+        """
         with self._lock:
-            rows = self._execute("SELECT last_ack FROM commands WHERE device = ? AND delivered = 0", (device,))
-        return tuple(codec.decode(row[0], Ack) for row in rows)
+            rows = self._execute(
+                "SELECT rowid, last_ack FROM commands WHERE device = ? AND delivered = 0 AND rowid > ? "
+                "ORDER BY rowid LIMIT ?",
+                (device, after, limit),
+            )
+        return {number: codec.decode(ack, Ack) for number, ack in rows}
 
     def end_open(self, *, now_ms: int, tick_ms: int) -> int:
         """Fail every command that a previous run did not finish. Called at start.

@@ -153,11 +153,6 @@ class OutboxStore:
 
         self._change(write)
 
-    def drop(self, ids: Iterable[int]) -> None:
-        """Drop and count items that were never acknowledged."""
-        for number in ids:
-            self._drop("id = ?", (number,))
-
     def count(self, dropped: Mapping[tuple[str, bool], int]) -> None:
         """Count messages that were dropped before they were stored."""
 
@@ -179,6 +174,16 @@ class OutboxStore:
             (late, last, limit),
         )
         return [(row[0], OutboxItem(row[1], row[2], row[3], late)) for row in rows]
+
+    def get(self, ids: Sequence[int]) -> dict[int, OutboxItem]:
+        """The items with these ids that are still stored, with their ids.
+
+        Raises:
+            OutboxStoreError: They cannot be read.
+        """
+        places = ",".join("?" * len(ids))
+        rows = self._read(f"SELECT id, topic, payload, at_ms, late FROM items WHERE id IN ({places})", tuple(ids))  # noqa: S608 (placeholders)  # nosec B608
+        return {row[0]: OutboxItem(row[1], row[2], row[3], bool(row[4])) for row in rows}
 
     def remove(self, ids: Sequence[int]) -> None:
         """Delete acknowledged items.

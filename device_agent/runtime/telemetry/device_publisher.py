@@ -39,13 +39,16 @@ from device_agent.runtime.authority.lease_gate import Lease
 from device_agent.runtime.control.base_motion import limits_of
 from device_agent.runtime.control.setpoint_stream import MAX_LOOP_AGE_S, WATCHDOG_S
 from device_agent.runtime.storage.journal import Journal
-from device_agent.runtime.telemetry.outbox import Outbox, Publish
+from device_agent.runtime.telemetry.outbox import FIRST_REPEAT_S, LAST_REPEAT_S, Outbox, Publish
 from device_agent.runtime.telemetry.rate_meter import RateMeter
 
 STATE_PERIOD_S = 30.0
 STATE_MIN_GAP_S = 1.0
 LOADED_STATE_PERIOD_S = 5.0
 """Period while the agent reduces work, for current rates [s]."""
+
+_MAX_REPEATED = 50
+"""Acks that are repeated at a time; the others follow after a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +76,8 @@ class StateSnapshot:
 class DevicePublisher:
     """Publisher of one device. Thread-safe.
 
-    Only the command processor calls ``publish_description``, ``publish_state`` and ``record_delivered``.
+    Only the command processor calls ``publish_description``, ``publish_state``, ``repeat_acks`` and
+    ``record_delivered``.
 
     Attributes:
         rejections: Number of rejections by code.
@@ -110,8 +114,10 @@ class DevicePublisher:
         self._publish = publish
         self._outbox = outbox
         self._delivered: queue.SimpleQueue[Ack] = queue.SimpleQueue()
-        self._acks_valid_from_s = float("-inf")
-        self._resend_acks = False
+        self._ack_sent = threading.Event()
+        self._repeat_s = float("inf")
+        self._pause_s = FIRST_REPEAT_S
+        self._repeated = 0
         self._sequences: dict[str, int] = {}
         self._lock = threading.Lock()
         self._rates = RateMeter()
@@ -139,12 +145,32 @@ class DevicePublisher:
         self.send_ack(ack)
 
     def send_ack(self, ack: Ack) -> None:
-        """Publish a journalled ack."""
-        self._publish(self._topic(topics.ACK), codec.encode(ack), qos=1, delivered=partial(self._on_delivered, ack))
+        """Publish a journalled ack; ``repeat_acks`` repeats it until it is delivered."""
+        self._transmit(ack)
+        self._ack_sent.set()
 
-    def _on_delivered(self, ack: Ack) -> None:
-        if time.monotonic() >= self._acks_valid_from_s:
-            self._delivered.put(ack)
+    def _transmit(self, ack: Ack) -> None:
+        self._publish(self._topic(topics.ACK), codec.encode(ack), qos=1, delivered=partial(self._delivered.put, ack))
+
+    def repeat_acks(self) -> None:
+        """Publish undelivered acks again: 1 s after a new one, then after twice the time, at most every 8 s."""
+        now_s = time.monotonic()
+        if self._ack_sent.is_set():
+            self._ack_sent.clear()
+            self._pause_s = FIRST_REPEAT_S
+            self._repeat_s = min(self._repeat_s, now_s + FIRST_REPEAT_S)
+        if now_s < self._repeat_s:
+            return
+        acks = self._journal.undelivered(self._name, after=self._repeated, limit=_MAX_REPEATED)
+        for ack in acks.values():
+            self._transmit(ack)
+        if len(acks) == _MAX_REPEATED:
+            self._repeated, self._repeat_s = max(acks), now_s + FIRST_REPEAT_S
+        elif acks or self._repeated:
+            self._repeated, self._repeat_s = 0, now_s + self._pause_s
+            self._pause_s = min(2 * self._pause_s, LAST_REPEAT_S)
+        else:
+            self._repeat_s = float("inf")
 
     def record_delivered(self) -> None:
         """Journal which acks were delivered."""
@@ -153,29 +179,17 @@ class DevicePublisher:
 
     # ------------------------------------------------------------ description and state
 
-    def on_connected(self) -> None:
-        """Ignore delivery confirmations until the outbox's settle time has passed; see ``Outbox``."""
-        self._acks_valid_from_s = time.monotonic() + self._outbox.settle_s
-        self._resend_acks = self._outbox.settle_s > 0
-
     def publish_description(self, twin: Twin | None) -> None:
-        """Publish the description and unconfirmed acks, and make the next state due: the link is up."""
+        """Publish the description, and make the next state and undelivered acks due: the link is up."""
         self._retain(self._topic(topics.DESC), self._description())
         if twin is not None:
             self._retain(self._topic(topics.DESC, topics.TWIN), twin)
         self._published_s = float("-inf")
-        self._send_undelivered()
-
-    def _send_undelivered(self) -> None:
-        for ack in self._journal.undelivered(self._name):
-            self.send_ack(ack)
+        self._repeated, self._repeat_s, self._pause_s = 0, float("-inf"), FIRST_REPEAT_S
 
     def publish_state(self, snapshot: StateSnapshot) -> None:
         """Publish ``state`` on change, at most once a second, and every 30 s."""
         now_s = time.monotonic()
-        if self._resend_acks and now_s >= self._acks_valid_from_s:
-            self._resend_acks = False
-            self._send_undelivered()
         key = snapshot.key()
         age_s = now_s - self._published_s
         period_s = LOADED_STATE_PERIOD_S if snapshot.load else STATE_PERIOD_S

@@ -1,7 +1,7 @@
 """Outbox: stores and forwards events, and measurements that were taken without a link.
 
-Callers never wait. The outbox's own thread writes to disk, sends at a low rate while the link is up, and deletes
-acknowledged messages. A full disk does not stop it.
+Callers never wait. The outbox's own thread writes to disk, sends at a low rate while the link is up, repeats messages
+until they are delivered, and then deletes them. A full disk does not stop it.
 """
 
 import logging
@@ -26,14 +26,14 @@ RATE_HZ = 20.0
 """Maximum rate of stored messages: a tenth of the live messages of one moving robot and its camera [Hz]."""
 BUSY_RATE_HZ = 5.0
 """Maximum rate while a device moves [Hz]."""
+FIRST_REPEAT_S, LAST_REPEAT_S = 1.0, 8.0
+"""An undelivered message is sent again after this time, then after twice the time, up to the second value [s]."""
 _WINDOW = 10
-"""Messages in flight; a live message waits behind at most this many."""
+"""Undelivered messages of the last ``FIRST_REPEAT_S``; a live message waits behind at most this many."""
+_MAX_LATE = 50
+"""Undelivered measurements that are repeated; further ones wait. Events never wait for a delivery."""
 _UNCERTAIN_S = 10.0
 """Measurements sent this shortly before the loss of the link was detected are stored as well [s]."""
-_ACK_TIMEOUT_S = 30.0
-"""A message without acknowledgement is sent again after this time [s]."""
-_MAX_ATTEMPTS = 5
-"""A message that was never acknowledged in this many attempts is dropped and counted."""
 _MAX_UNSAVED = 500
 _MAX_INCOMING = 5000
 _SAVE_RETRY_S = 5.0
@@ -50,6 +50,15 @@ class _SampledStream:
     sent: deque[tuple[float, OutboxItem]]
 
 
+@dataclass(frozen=True, slots=True)
+class _Flight:
+    """A sent message that is not delivered: when it was sent [s], and after which time it is sent again [s]."""
+
+    late: bool
+    sent_s: float
+    pause_s: float
+
+
 class Outbox:
     """The outbox of an agent. ``add_event`` and ``add_measurement`` are thread-safe and never block.
 
@@ -59,8 +68,6 @@ class Outbox:
         device_topic: Topic ``ts/v1/{space}/{agent}/{device}`` under which disk errors are reported.
         is_quiet: Whether nothing moves.
         keep_hz: Maximum rate of stored measurements of one stream [Hz].
-        settle_s: Delay between the connection and the first message [s]. A broker acknowledges messages even while the
-            ingest that stores them still reconnects.
     """
 
     def __init__(
@@ -71,21 +78,18 @@ class Outbox:
         device_topic: str,
         is_quiet: Callable[[], bool] = lambda: True,
         keep_hz: float = 1.0,
-        settle_s: float = 0.0,
     ) -> None:
         self._store = store
         self._publish = publish
         self._device_topic = device_topic
         self._is_quiet = is_quiet
         self._period_s = 1 / keep_hz
-        self.settle_s = settle_s
-        self._send_from_s = float("inf")
         # The lock protects these; all others belong to the outbox's thread.
         self._lock = threading.Lock()
         self._streams: dict[str, _SampledStream] = {}
         self._incoming: deque[OutboxItem] = deque()
         self._lost: Counter[tuple[str, bool]] = Counter()
-        self._acknowledged: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._delivered: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._wake = threading.Event()
         self._stopping = threading.Event()
         self._up = threading.Event()
@@ -97,8 +101,7 @@ class Outbox:
         self._save_retry_s = float("-inf")
         self._unsaved: dict[int, OutboxItem] = {}
         self._number = 0
-        self._in_flight: dict[int, float] = {}
-        self._attempts: Counter[int] = Counter()
+        self._in_flight: dict[int, _Flight] = {}
         self._sent = {False: 0, True: 0}
         self._tokens = float(_WINDOW)
         self._filled_s = float("inf")
@@ -178,26 +181,24 @@ class Outbox:
 
     def _iterate(self, now_s: float) -> None:
         try:
-            self._remove_acknowledged()
+            self._remove_delivered()
             self._save(now_s)
             if self._connected.is_set():
                 self._connected.clear()
-                self._send_from_s = now_s + self.settle_s
                 self._resend_all()
-            if self._up.is_set() and now_s >= self._send_from_s:
+            if self._up.is_set():
                 self._send(now_s)
         except OutboxStoreError as error:
             self._fail(error, now_s)
         except Exception:  # noqa: BLE001 (any error: later messages must still be stored)
             _log.exception("outbox")
 
-    def _remove_acknowledged(self) -> None:
-        """Delete acknowledged messages."""
+    def _remove_delivered(self) -> None:
+        """Delete delivered messages."""
         saved = []
-        while not self._acknowledged.empty():
-            number = self._acknowledged.get()
+        while not self._delivered.empty():
+            number = self._delivered.get()
             self._in_flight.pop(number, None)
-            self._attempts.pop(number, None)
             self._unsaved.pop(number, None)
             if number > 0:
                 saved.append(number)
@@ -222,6 +223,8 @@ class Outbox:
             self._keep_in_memory(incoming)
             self._fail(error, now_s)
             return
+        for number in self._unsaved:  # now rows on disk
+            self._in_flight.pop(number, None)
         self._unsaved.clear()
         if self._error:
             _log.warning("unsent messages are stored on disk again")
@@ -264,45 +267,42 @@ class Outbox:
         rate_hz = RATE_HZ if self._is_quiet() else BUSY_RATE_HZ
         self._tokens = min(float(_WINDOW), self._tokens + max(0.0, now_s - self._filled_s) * rate_hz)
         self._filled_s = now_s
-        self._handle_timeouts(now_s)
-        for number, item in self._next(min(int(self._tokens), _WINDOW - len(self._in_flight))):
-            self._in_flight[number] = now_s
+        recent = sum(now_s - flight.sent_s < FIRST_REPEAT_S for flight in self._in_flight.values())
+        for number, item in self._next(now_s, min(int(self._tokens), _WINDOW - recent)):
             if not self._publish(item.topic, item.payload, qos=1, delivered=partial(self._on_delivered, number)):
-                del self._in_flight[number]
                 return
+            before = self._in_flight.get(number)
+            pause_s = FIRST_REPEAT_S if before is None else min(2 * before.pause_s, LAST_REPEAT_S)
+            self._in_flight[number] = _Flight(item.late, now_s, pause_s)
             self._tokens -= 1
-            if number > 0:
-                self._sent[item.late] = number
+            self._sent[item.late] = max(self._sent[item.late], number)
 
-    def _next(self, limit: int) -> list[tuple[int, OutboxItem]]:
-        """The next messages: events before measurements, oldest first."""
+    def _next(self, now_s: float, limit: int) -> list[tuple[int, OutboxItem]]:
+        """The next messages: new events, then undelivered messages whose repetition is due, then new measurements."""
         items = [item for item in self._unsaved.items() if item[0] not in self._in_flight][: max(0, limit)]
-        for late in (False, True):
-            if self._open and len(items) < limit:
-                items += self._store.after(self._sent[late], late=late, limit=limit - len(items))
-        return items
+        items += self._new(limit - len(items), late=False)
+        items += self._due(now_s, limit - len(items))
+        late = sum(flight.late for flight in self._in_flight.values())
+        return items + self._new(min(limit - len(items), _MAX_LATE - late), late=True)
+
+    def _new(self, limit: int, *, late: bool) -> list[tuple[int, OutboxItem]]:
+        """Stored messages that were not sent over this link, oldest first."""
+        return self._store.after(self._sent[late], late=late, limit=limit) if self._open and limit > 0 else []
+
+    def _due(self, now_s: float, limit: int) -> list[tuple[int, OutboxItem]]:
+        """Undelivered messages to send again, those that have waited longest first."""
+        due = [number for number, flight in self._in_flight.items() if now_s - flight.sent_s >= flight.pause_s]
+        due = sorted(due, key=lambda number: self._in_flight[number].sent_s)[: max(0, limit)]
+        stored = self._store.get([number for number in due if number > 0]) if self._open and due else {}
+        items = self._unsaved | stored
+        for number in due:
+            if number not in items:  # dropped: the outbox is full
+                del self._in_flight[number]
+        return [(number, items[number]) for number in due if number in items]
 
     def _on_delivered(self, number: int) -> None:
-        self._acknowledged.put(number)
+        self._delivered.put(number)
         self._wake.set()
-
-    def _handle_timeouts(self, now_s: float) -> None:
-        """Send unacknowledged messages again; drop and count those with too many attempts."""
-        overdue = [number for number, sent_s in self._in_flight.items() if now_s - sent_s > _ACK_TIMEOUT_S]
-        if not overdue:
-            return
-        self._in_flight.clear()
-        self._sent = {False: 0, True: 0}
-        self._attempts.update(overdue)
-        failed = [number for number in overdue if self._attempts[number] >= _MAX_ATTEMPTS]
-        for number in failed:
-            del self._attempts[number]
-            if number in self._unsaved:
-                with self._lock:
-                    self._lose(self._unsaved.pop(number))
-        if failed:
-            _log.error("%d messages were never acknowledged and are dropped", len(failed))
-            self._store.drop(number for number in failed if number > 0)
 
 
 def _dropped_event(dropped: DroppedCount) -> OutboxItem:

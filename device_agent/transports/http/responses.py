@@ -25,7 +25,10 @@ class Address(Struct, frozen=True, kw_only=True):
 
 
 class MqttCredentials(Struct, frozen=True, kw_only=True):
-    """Broker credentials, valid for ``lifetime_s`` from now on [s]."""
+    """Broker credentials, valid for ``lifetime_s`` from now on [s].
+
+    ``confirmations``: topics on which the server confirms stored messages; ``None``: an older server does not.
+    """
 
     tcp: Address
     client_id: str
@@ -33,6 +36,7 @@ class MqttCredentials(Struct, frozen=True, kw_only=True):
     password: str
     subscribe: tuple[str, ...]
     lifetime_s: Lifetime
+    confirmations: str | None = None
 
 
 class XmppCredentials(Struct, frozen=True, kw_only=True):

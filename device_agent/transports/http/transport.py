@@ -304,7 +304,7 @@ class HttpTransport:
                 raise
             self._check(self._send_api)
             if len(batch) == 1:
-                _log.warning("the cloud rejects a message on %s: %s", batch[0].topic, error)
+                self._process_results(batch, [str(error)])
                 return
             # One of the messages is invalid: send the others.
             self._send_batch(batch[: len(batch) // 2])
@@ -316,10 +316,9 @@ class HttpTransport:
 
     def _process_results(self, batch: Sequence[Message], results: Sequence[str | None]) -> None:
         for message, rejection in zip(batch, results, strict=True):
-            if rejection is not None:
+            if rejection is not None:  # permanent, so the message is not sent again
                 _log.warning("the cloud rejects a message on %s: %s", message.topic, rejection[:300])
-                continue
-            if message.is_ack:
+            elif message.is_ack:
                 self._remove_received(message.payload)
             if message.delivered is not None:
                 message.delivered()

@@ -21,6 +21,7 @@ from device_agent.transports import tls
 from device_agent.transports.backoff import BackOff
 from device_agent.transports.http.client import CloudClient
 from device_agent.transports.http.responses import MqttCredentials
+from device_agent.transports.mqtt.confirmations import Confirmations
 from device_agent.transports.mqtt.connection import Connection
 
 KEEP_ALIVE_S = 4
@@ -51,6 +52,7 @@ class BrokerAccess:
 
     Attributes:
         subscribe: Filters to subscribe to.
+        confirmations: Topics on which the cloud confirms stored messages; ``None``: it does not.
         lifetime_s: Validity of the credentials from now on [s].
         tls: TLS context; ``None`` for a connection without TLS.
     """
@@ -62,6 +64,7 @@ class BrokerAccess:
     password: str
     subscribe: tuple[str, ...]
     lifetime_s: float
+    confirmations: str | None = None
     tls: ssl.SSLContext | None = None
 
 
@@ -82,6 +85,7 @@ def broker_access(
         password=credentials.password,
         subscribe=credentials.subscribe,
         lifetime_s=credentials.lifetime_s,
+        confirmations=credentials.confirmations,
         tls=tls.broker(tls=credentials.tcp.tls, server=api.server, ca=api.ca, own=own),
     )
 
@@ -115,6 +119,10 @@ def new_client(
 class MqttTransport:
     """``ports.transport.Transport`` over MQTT.
 
+    The broker's acknowledgement does not prove that the cloud has stored a message: brokers drop messages while no
+    worker is connected. Acks, events and late measurements are therefore delivered when the cloud confirms them. Other
+    messages, and all messages to a server that does not confirm, are delivered when the broker acknowledges them.
+
     Args:
         access: Requests credentials; raises ``OSError`` or ``ValueError`` if none are available now.
         presence_topic: Topic of presence and will.
@@ -146,6 +154,7 @@ class MqttTransport:
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._frames: dict[str, mqtt.MQTTMessageInfo] = {}
+        self._confirmations = Confirmations()
         self._session = 0
         self._command_subscription: int | None = None
         self._lost = threading.Event()
@@ -169,7 +178,11 @@ class MqttTransport:
         frame = f"/{topics.CAM}/" in topic
         if frame and (before := self._frames.get(topic)) is not None and not before.is_published():
             return False  # on a slow link, queued frames would delay all live messages
-        sent = connection.publish(topic, payload, qos=qos, retain=retain, delivered=delivered if qos else None)
+        if qos == 0:
+            delivered = None
+        if delivered is not None and self._confirmations.expect(topic, payload, delivered):
+            delivered = None
+        sent = connection.publish(topic, payload, qos=qos, retain=retain, delivered=delivered)
         if sent is None:
             return False
         if frame:
@@ -214,7 +227,8 @@ class MqttTransport:
         self._session = self._next_session()
         self._frames = {}
         self._lost.clear()
-        connection = self._connection = Connection(self._new_client(access), self._receive)
+        self._confirmations.filter = access.confirmations or ""
+        connection = self._connection = Connection(self._new_client(access), self._on_message)
         try:
             connection.open(access.host, access.port, keep_alive_s=KEEP_ALIVE_S)
             started_s = time.monotonic()
@@ -268,6 +282,10 @@ class MqttTransport:
                 self._interruption = None
             self._link_changed(True)
 
+    def _on_message(self, topic: str, payload: bytes) -> None:
+        if not self._confirmations.receive(topic, payload):
+            self._receive(topic, payload)
+
     def _publish_offline(self, connection: Connection) -> None:
         offline = connection.publish(self._presence_topic, self._presence(online=False), qos=1, retain=True)
         until_s = time.monotonic() + _DISCONNECT_S
@@ -301,7 +319,10 @@ class MqttTransport:
                 _log.warning("the broker rejected the connection: %s", code)
             client.disconnect()
             return
-        _, self._command_subscription = client.subscribe([(pattern, 1) for pattern in access.subscribe])
+        filters = [(pattern, 1) for pattern in access.subscribe]
+        if access.confirmations is not None:
+            filters.append((access.confirmations, 0))
+        _, self._command_subscription = client.subscribe(filters)
 
     def _on_subscribe(
         self, client: mqtt.Client, _access: object, mid: int, codes: list[ReasonCode], _properties: Properties | None

@@ -29,9 +29,11 @@ async def work(functions: Functions) -> None:
 
     async def handle(topic: str, payload: bytes) -> None:
         await ingest(functions, topic, payload)
+        await functions.confirmations.publish([(topic, payload)])
 
     async def handle_telemetry(messages: Sequence[tuple[str, bytes]]) -> None:
         await ingest_telemetry(functions, messages)
+        await functions.confirmations.publish(messages)
 
     function_app.run_for_long()
     tasks = [

@@ -1,6 +1,7 @@
 """Stores device messages from Event Grid events, AWS IoT rules, and SQS queues behind these rules.
 
 If a message cannot be stored, an exception makes the cloud deliver it again. An invalid message is logged and dropped.
+Stored and dropped messages are confirmed to their agents.
 All sources deliver at least once and in any order; ``ingest`` is idempotent and independent of the order.
 """
 
@@ -28,13 +29,14 @@ async def from_event_grid(functions: Functions, events: Sequence[Mapping[str, An
     """Store MQTT messages that an Event Grid namespace routes as CloudEvents 1.0.
 
     The topic is the event's ``subject``. The payload is in ``data_base64``, or in ``data`` if the publisher declared it
-    as JSON.
+    as JSON. The latter has lost its exact bytes, so its confirmation has no effect; agents declare no content type.
 
     Raises:
         Problem, StoreError: At least one message is not stored; all must be delivered again.
     """
     failed: Problem | StoreError | None = None
     telemetry: list[tuple[str, bytes]] = []
+    stored: list[tuple[str, bytes]] = []
     for event in events:
         if event.get("type") != _MQTT:
             _log.warning("ignored an event of type '%s'", str(event.get("type"))[:_MAX_LOGGED])
@@ -49,12 +51,15 @@ async def from_event_grid(functions: Functions, events: Sequence[Mapping[str, An
             continue
         try:
             await ingest(functions, topic, payload)
+            stored.append((topic, payload))
         except (Problem, StoreError) as error:
             failed = error
     try:
         await ingest_telemetry(functions, telemetry)
+        stored += telemetry
     except (Problem, StoreError) as error:
         failed = error
+    await functions.confirmations.publish(stored)
     if failed is not None:
         raise failed
 
@@ -68,6 +73,7 @@ async def from_iot_rule(functions: Functions, event: Mapping[str, Any]) -> None:
     message = _rule_message(event)
     if message is not None:
         await ingest(functions, *message)
+        await functions.confirmations.publish([message])
 
 
 async def from_queue(functions: Functions, event: Mapping[str, Any]) -> dict[str, list[dict[str, str]]]:
@@ -78,6 +84,7 @@ async def from_queue(functions: Functions, event: Mapping[str, Any]) -> dict[str
     """
     failed: list[str] = []
     telemetry: dict[str, tuple[str, bytes]] = {}
+    stored: list[tuple[str, bytes]] = []
     for record in event.get("Records", ()):
         message = _rule_message(_body(record))
         if message is None:
@@ -87,14 +94,17 @@ async def from_queue(functions: Functions, event: Mapping[str, Any]) -> dict[str
             continue
         try:
             await ingest(functions, *message)
+            stored.append(message)
         except (Problem, StoreError) as error:
             _log.warning("record %s was not stored: %s", record.get("messageId"), error)
             failed.append(str(record["messageId"]))
     try:
         await ingest_telemetry(functions, list(telemetry.values()))
+        stored += telemetry.values()
     except (Problem, StoreError) as error:
         _log.warning("%d telemetry records were not stored: %s", len(telemetry), error)
         failed += telemetry
+    await functions.confirmations.publish(stored)
     return {"batchItemFailures": [{"itemIdentifier": record} for record in failed]}
 
 

@@ -1,7 +1,7 @@
 """Short-lived broker credentials with minimal permissions."""
 
 from collections.abc import Awaitable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from device_agent.protocol import topics
 from device_agent.protocol.security import grants
@@ -29,7 +29,10 @@ TOPIC_BYTES = 10_000
 
 @dataclass(frozen=True, slots=True)
 class IssuedCredentials:
-    """Credentials, and the topics that they allow."""
+    """Credentials, and the topics that they allow.
+
+    ``confirmations``: topics on which an agent receives confirmations of stored messages.
+    """
 
     client_id: str
     credentials: Credentials
@@ -37,6 +40,7 @@ class IssuedCredentials:
     lifetime_s: int
     publish: tuple[str, ...]
     subscribe: tuple[str, ...]
+    confirmations: str | None = None
 
 
 class MqttCredentials:
@@ -149,7 +153,8 @@ class MqttCredentials:
         """
         space = require_claimed(agent)
         grant = grants.agent_grant(space, agent.id, token_id=new_id(), lifetime_s=AGENT_S)
-        return await self._issue(grant, AGENT_S, grant.publish, grants.agent_command_topics(space, agent.id))
+        issued = await self._issue(grant, AGENT_S, grant.publish, grants.agent_command_topics(space, agent.id))
+        return replace(issued, confirmations=grants.agent_confirmations(space, agent.id))
 
     async def _issue(
         self, grant: Grant, lifetime_s: int, publish: tuple[str, ...], subscribe: tuple[str, ...]

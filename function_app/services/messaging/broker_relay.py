@@ -1,4 +1,4 @@
-"""Republishes messages that arrived by HTTP or XMPP on the broker, for consoles and other subscribers."""
+"""Publishes to the broker what may be lost: messages that arrived by HTTP or XMPP, and confirmations for agents."""
 
 import asyncio
 import logging
@@ -14,12 +14,13 @@ TIMEOUT_S = 2.0
 PAUSE_MS = 5_000
 """Pause after a failure."""
 _RETAINED = frozenset({topics.CONN, topics.DESC, topics.STATE})
+_AT_MOST_ONCE = frozenset({topics.TELE, topics.STORED})
 
 _log = logging.getLogger(__name__)
 
 
 class BrokerRelay:
-    """Publishes messages that are already stored, best effort."""
+    """Publishes messages, best effort."""
 
     def __init__(self, *, bus: CommandBus, clock: Clock) -> None:
         self._bus = bus
@@ -47,4 +48,4 @@ class BrokerRelay:
             if retain and len(payload) > codec.MAX_RETAINED_BYTES:
                 _log.warning("%s is too long for a retained message", topic)
                 continue
-            await self._bus.publish(topic, payload, qos=0 if parsed.kind == topics.TELE else 1, retain=retain)
+            await self._bus.publish(topic, payload, qos=0 if parsed.kind in _AT_MOST_ONCE else 1, retain=retain)

@@ -187,6 +187,28 @@ def test_an_agent_cannot_receive_messages_to_or_of_another(broker: RunningBroker
         assert topics_until_silence(evil) == [own]
 
 
+def test_only_the_functions_confirm_and_only_to_the_agent_itself(broker: RunningBroker, space: str) -> None:
+    own, other = f"ts/v1/{space}/arm/ur5/stored", f"ts/v1/{space}/evil/ur5/stored"
+    with listen(broker, space, own, other) as listener, broker.service() as functions:
+        for name in ("arm", "evil"):
+            for topic in (own, other):
+                with broker.connect(name, agent_of(broker, space, name)) as agent:
+                    agent.publish(topic, b"forged")
+                    wait_until(lambda: agent.disconnected.is_set() or broker.kind == "mosquitto", "the end")
+        with (
+            broker.connect("arm", agent_of(broker, space, "arm")) as arm,
+            broker.connect("evil", agent_of(broker, space, "evil")) as evil,
+        ):
+            evil.subscribe(own, f"ts/v1/{space}/+/+/stored")
+            assert arm.subscribe(grants.agent_confirmations(space, "arm")) == [1]
+            assert evil.subscribe(grants.agent_confirmations(space, "evil")) == [1]
+            functions.publish(own, b"stored", qos=0)
+            functions.publish_acknowledged(other, b"end")
+            assert arm.receive().payload == b"stored"
+            assert topics_until_silence(evil) == [other]
+        assert listener.received() == [b"stored", b"end"]
+
+
 def test_an_agent_only_receives_telemetry_of_its_space(broker: RunningBroker, space: str) -> None:
     measured = f"ts/v1/{space}/sensors/pir/tele/presence"
     kinds = ("late/presence", "cam/room", "event", "ack", "cmd", "ctl/1", "stop", "desc", "state")

@@ -233,8 +233,7 @@ class AgentSuite:
         last = agent.journalled(action["id"])
         assert last.reason is not None
         assert (last.status, last.reason.code) == (AckStatus.FAILED, "link_lost")
-        if spoken.stores:
-            assert agent.end_of(action["id"])["reason"]["code"] == "link_lost"
+        assert agent.end_of(action["id"])["reason"]["code"] == "link_lost"
         time.sleep(0.5)
         assert agent.moved_since(back_s) == [], "nothing resumes"
         assert agent.take() > epoch

@@ -36,14 +36,12 @@ class Spoken:
         configuration: Its part of ``agent.toml``.
         endpoint: Other end of its connection, one of ``processes.endpoints``.
         notices_s: Time in which it detects a network that drops all data while something moves [s].
-        stores: Whether an acknowledged message is in the cloud's tables; a broker acknowledges for itself alone.
         broker: Broker of the cloud.
     """
 
     configuration: Mapping[str, Any] = field(default_factory=dict)
     endpoint: str
     notices_s: float
-    stores: bool = False
     broker: BrokerKind = "amqtt"
 
 

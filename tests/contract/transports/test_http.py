@@ -9,7 +9,7 @@ from tests.contract.transports.suite import Spoken, TransportSuite
 
 
 class TestLongPolls(TransportSuite):
-    spoken = Spoken(configuration={"transport": "http"}, endpoint="server", notices_s=SILENCE_TIMEOUT_S, stores=True)
+    spoken = Spoken(configuration={"transport": "http"}, endpoint="server", notices_s=SILENCE_TIMEOUT_S)
 
 
 class TestPlainPolls(TransportSuite):
@@ -17,7 +17,6 @@ class TestPlainPolls(TransportSuite):
         configuration={"transport": "http", "http": HttpPolling(poll="plain", poll_ms=100)},
         endpoint="server",
         notices_s=SILENCE_TIMEOUT_S,
-        stores=True,
     )
 
 

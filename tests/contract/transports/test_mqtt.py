@@ -5,11 +5,12 @@ import time
 
 import pytest
 
-from device_agent.protocol import topics
+from device_agent.ports.clock import wall_ms
+from device_agent.protocol import Event, codec, topics
 from device_agent.transports.mqtt.transport import SILENCE_TIMEOUT_S
 from tests.contract.transports.agent_suite import FAR, AgentSuite, PairedAgent
 from tests.contract.transports.suite import Spoken, TransportSuite
-from tests.harness.cloud.cloud_processes import Link
+from tests.harness.cloud.cloud_processes import CloudProcesses, Link
 from tests.harness.network.brokers import PATIENCE_S, SILENCE_S, wait_until
 
 
@@ -27,7 +28,22 @@ class _OverMqtt(TransportSuite):
         time.sleep(SILENCE_S)
         assert not acknowledged.is_set()
         fragile.proxy.thaw()
-        wait_until(acknowledged.is_set, "the broker's acknowledgement")
+        wait_until(acknowledged.is_set, "the cloud's confirmation")
+
+    def test_a_message_is_delivered_when_the_cloud_has_stored_it(self, processes: CloudProcesses, link: Link) -> None:
+        link.start().up()
+        payload = codec.encode(Event(id="e1", device="arm", at_ms=wall_ms(), kind="k", severity="info", message="x"))
+        delivered = threading.Event()
+        processes.cloud.stop_ingest()
+        assert link.publish(topics.EVENT, payload, delivered.set)
+        wait_until(lambda: link.published(topics.EVENT) == [payload], "the message at the broker")
+        time.sleep(SILENCE_S)
+        assert not delivered.is_set()
+        processes.cloud.start_ingest()
+        assert link.publish(topics.EVENT, payload, delivered.set)
+        wait_until(delivered.is_set, "the confirmation")
+        events = processes.anna.get(f"/devices/{link.robot.device}/events").json()["items"]
+        assert "e1" in {event["id"] for event in events}
 
 
 class TestAmqtt(_OverMqtt):

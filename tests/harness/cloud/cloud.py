@@ -145,8 +145,20 @@ class Cloud:
 
         async def handle(topic: str, payload: bytes) -> None:
             await ingest(self.functions, topic, payload)
+            await self.functions.confirmations.publish([(topic, payload)])
 
         self._run_feed(self.functions.feed, handle)
+
+    def stop_ingest(self) -> None:
+        """Process no more messages of agents, like a killed worker."""
+
+        async def stop() -> None:
+            feeds, self._feeds = self._feeds, []
+            for feed in feeds:
+                feed.cancel()
+            await asyncio.gather(*feeds, return_exceptions=True)
+
+        self.run(stop())
 
     def start_telemetry(self) -> None:
         """Process live measurements until the end; returns when it is subscribed."""
@@ -158,6 +170,7 @@ class Cloud:
 
     async def _store(self, messages: Sequence[tuple[str, bytes]]) -> None:
         await ingest_telemetry(self.functions, messages)
+        await self.functions.confirmations.publish(messages)
 
     def _run_feed(self, feed: Any, handle: Callable[..., Coroutine[Any, Any, None]]) -> None:
         async def start() -> None:

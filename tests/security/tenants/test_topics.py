@@ -80,7 +80,7 @@ def _stage(broker: RunningBroker, cloud: Cloud, observer: Client) -> Stage:
         f"ts/v1/{robot.space}/#",
         f"ts/v1/+/{robot.id}/#",
         "ts/v1/+/+/conn",
-        *(f"ts/v1/+/+/+/{kind}" for kind in ("state", "desc", "event", "ack", "cmd")),
+        *(f"ts/v1/+/+/+/{kind}" for kind in ("state", "desc", "event", "ack", "cmd", "stored")),
         *(f"ts/v1/+/+/+/{kind}/+" for kind in ("tele", "cam", "ctl", "late", "desc", "stop")),
     )
     return Stage(broker, roles, topics, wide, observer)

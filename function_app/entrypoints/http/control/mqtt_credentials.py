@@ -42,6 +42,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             lifetime_s=issued.lifetime_s,
             publish=issued.publish,
             subscribe=issued.subscribe,
+            confirmations=issued.confirmations,
             tcp=schemas.TcpAddress(
                 host=settings.mqtt_host,
                 port=settings.mqtt_port,

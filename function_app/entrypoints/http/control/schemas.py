@@ -147,7 +147,12 @@ class TcpAddress(Response, frozen=True, kw_only=True):
 
 
 class MqttCredentialsOut(Response, frozen=True, kw_only=True):
-    """Credentials and their topics. For an agent also the statements that rotate the server's signing keys."""
+    """Credentials and their topics.
+
+    For an agent also the statements that rotate the server's signing keys, and ``confirmations``: the topics on which
+    the server confirms acks, events and late measurements after storage. An agent that subscribes to them repeats these
+    messages until confirmation.
+    """
 
     client_id: str
     username: str
@@ -156,6 +161,7 @@ class MqttCredentialsOut(Response, frozen=True, kw_only=True):
     lifetime_s: int
     publish: tuple[str, ...]
     subscribe: tuple[str, ...]
+    confirmations: str | None = None
     tcp: TcpAddress
     websocket_url: str
     server_time_ms: int

@@ -68,7 +68,6 @@ def test_defaults(tmp_path: Path) -> None:
         ("[buffer]\nmax_mb = 0.5\n", "max_mb"),
         ("[buffer]\nmax_age_h = nan\n", "max_age_h"),
         ("[buffer]\nmeasurements_hz = 0\n", "measurements_hz"),
-        ("[buffer]\nsettle_s = -1\n", "settle_s"),
         ('[[room]]\ndevice = "pir"\nstream = "presence"\n', "'pir' is not a device of this agent .arm.; name a"),
         (f"{INTERLOCK}[[devices.interlocks]]\nspeed = 0.5\n", "device"),
         (INTERLOCK.replace("equals = true", ""), "exactly one of above, below, equals"),

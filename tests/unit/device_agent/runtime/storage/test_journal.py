@@ -67,10 +67,19 @@ def test_acks_are_undelivered_until_the_newest_is_delivered(journal: Journal) ->
     journal.begin("arm", first)
     journal.record(second)
     journal.delivered(first)
-    assert journal.undelivered("arm") == (second,)
-    assert journal.undelivered("head") == ()
+    assert list(journal.undelivered("arm").values()) == [second]
+    assert journal.undelivered("head") == {}
     journal.delivered(second)
-    assert journal.undelivered("arm") == ()
+    assert journal.undelivered("arm") == {}
+
+
+def test_undelivered_acks_are_read_in_parts(journal: Journal) -> None:
+    acks = [ack(f"c{number}") for number in range(3)]
+    for each in acks:
+        journal.begin("arm", each)
+    first = journal.undelivered("arm", limit=2)
+    assert list(first.values()) == acks[:2]
+    assert list(journal.undelivered("arm", after=max(first), limit=2).values()) == acks[2:]
 
 
 def test_epochs_and_latch_persist_and_epochs_never_decrease(open_journal: OpenJournal) -> None:

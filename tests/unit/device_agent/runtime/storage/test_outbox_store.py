@@ -120,11 +120,12 @@ def test_old_measurements_are_dropped_and_counted(store: OutboxStore) -> None:
     assert dropped(store) == [], "reported once"
 
 
-def test_unacknowledged_items_are_dropped_and_counted(store: OutboxStore) -> None:
-    store.put([item(1), item(2)], now_ms=NOW_MS)
-    store.drop([number for number, _ in store.after(0, late=True, limit=1)])
-    assert numbers(store) == [2]
-    assert dropped(store)[0].measurements == 1
+def test_stored_items_are_read_by_id(store: OutboxStore) -> None:
+    store.put([item(1), item(2), item(3)], now_ms=NOW_MS)
+    (first, one), (second, _), (third, three) = store.after(0, late=True, limit=3)
+    store.remove([second])
+    assert store.get([third, second, first]) == {first: one, third: three}
+    assert store.get([]) == {}
 
 
 def test_drop_events_are_stored_atomically(store: OutboxStore) -> None:

@@ -11,7 +11,7 @@ from device_agent.runtime.telemetry import latency_probe as module
 from device_agent.runtime.telemetry.latency_probe import MAX_SAMPLES, LatencyProbe, Sample
 from tests.harness.agent.device_harness import eventually
 
-ARM, LEG = "ts/v1/s/a/arm/state", "ts/v1/s/a/leg/ack"
+ARM, LEG = "ts/v1/s/a/arm/state", "ts/v1/s/a/leg/state"
 NOW_MS = 1_800_000_000_000
 
 
@@ -80,7 +80,9 @@ def test_an_acknowledged_message_gives_a_sample_and_calls_the_sender(fixture: Pr
     assert ms == pytest.approx(50)
 
 
-@pytest.mark.parametrize(("kind", "qos"), [("tele/joints", 0), ("late/joints", 1), ("event", 1), ("desc", 1)])
+@pytest.mark.parametrize(
+    ("kind", "qos"), [("tele/joints", 0), ("late/joints", 1), ("event", 1), ("ack", 1), ("desc", 1)]
+)
 def test_unacknowledged_and_bulk_messages_are_not_measured(fixture: ProbeFixture, kind: str, qos: int) -> None:
     def delivered() -> None: ...
 

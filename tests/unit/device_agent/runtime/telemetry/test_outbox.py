@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -97,7 +98,7 @@ def test_an_event_is_stored_before_it_is_sent_and_deleted_after_the_ack(fixture:
     fixture.event("held")
     fixture.iterate()
     assert fixture.events() == fixture.stored() == ["held"]
-    fixture.iterate(20)
+    fixture.iterate(3)
     assert fixture.events() == ["held"], "it is in flight"
     fixture.acknowledge()
     fixture.iterate()
@@ -160,51 +161,93 @@ def test_the_send_rate_is_low_and_lower_during_motion(fixture: OutboxFixture) ->
     assert [payload for _, payload in fixture.sent] == [str(number).encode() for number in range(len(fixture.sent))]
 
 
-def test_sending_starts_after_the_settle_time(fixture: OutboxFixture) -> None:
-    fixture.outbox.settle_s = 8.0
-    fixture.event("held")
-    for _ in range(2):
-        fixture.connect()
-        fixture.iterate_for(8)
-        assert fixture.sent == []
-    fixture.iterate(2)
-    assert fixture.events() == ["held"]
-    fixture.event("live")
-    fixture.iterate()
-    assert fixture.events() == ["held", "live"], "then immediately"
-
-
 def test_messages_in_flight_are_limited_and_a_full_link_queue_is_retried(fixture: OutboxFixture) -> None:
     fixture.measure(0, 100)
     fixture.acknowledges = fixture.accepts = False
     fixture.connect()
     fixture.iterate(3)
     fixture.accepts = True
-    fixture.iterate(40)
+    fixture.iterate(4)
     assert len(fixture.sent) == module._WINDOW
     fixture.acknowledge()
-    fixture.iterate(8)
+    fixture.iterate(4)
     assert len(fixture.sent) == 2 * module._WINDOW
 
 
 @pytest.mark.parametrize("disk_full", [False, True])
-def test_messages_without_ack_are_retried_then_dropped_and_counted(
+def test_an_undelivered_message_is_repeated_after_growing_pauses_and_never_dropped(
     fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch, disk_full: bool
 ) -> None:
     if disk_full:
         monkeypatch.setattr(fixture.store, "put", fail)
     fixture.connect()
     fixture.acknowledges = False
-    fixture.event("refused")
-    fixture.iterate_for(module._ACK_TIMEOUT_S * (module._MAX_ATTEMPTS + 1))
-    assert fixture.events().count("refused") == module._MAX_ATTEMPTS
-    assert (fixture.stored(), fixture.outbox._unsaved) == ([], {})
-    if not disk_full:
-        fixture.outbox.link_changed(False)
-        fixture.connect()
+    fixture.event("held")
+    sent_s = []
+    for _ in range(4 * 60):
+        before = fixture.events().count("held")
         fixture.iterate()
-        (report,) = fixture.reports(EventKind.BUFFER_DROPPED)
-        assert report.data == {"measurements": 0, "events": 1}
+        sent_s += [fixture.now_s] * (fixture.events().count("held") - before)
+    pauses_s = [later - sooner for sooner, later in pairwise(sent_s)]
+    assert pauses_s == [1.0, 2.0, 4.0, 8.0, 8.0, 8.0, 8.0, 8.0, 8.0]
+    fixture.acknowledge()
+    fixture.iterate()
+    assert (fixture.stored(), fixture.outbox._unsaved, fixture.outbox._in_flight) == ([], {}, {})
+
+
+def test_a_new_event_is_sent_at_once_while_many_messages_are_undelivered(fixture: OutboxFixture) -> None:
+    fixture.connect()
+    fixture.acknowledges = False
+    fixture.event(*map(str, range(100)))
+    fixture.measure(0, 1000, each_s=0.0)
+    fixture.iterate_for(60)
+    assert len({payload for topic, payload in fixture.sent if topic == LATE}) <= module._MAX_LATE
+    for number in range(5):
+        fixture.event(f"new {number}")
+        fixture.iterate(4)
+        assert f"new {number}" in fixture.events(), "within a second"
+    assert len(fixture.sent) <= 11 * 66, "and not more than ten messages a second"
+
+
+def test_undelivered_measurements_are_repeated_and_bounded(fixture: OutboxFixture) -> None:
+    fixture.measure(0, 1000)
+    fixture.connect()
+    fixture.acknowledges = False
+    fixture.iterate_for(120)
+    assert {payload for _, payload in fixture.sent} == {str(number).encode() for number in range(module._MAX_LATE)}
+    assert len(fixture.sent) > 2 * module._MAX_LATE
+    fixture.acknowledges = True
+    fixture.acknowledge()
+    fixture.iterate_for(1)
+    assert len({payload for _, payload in fixture.sent}) > module._MAX_LATE
+
+
+def test_a_dropped_message_is_not_repeated(fixture: OutboxFixture) -> None:
+    fixture.connect()
+    fixture.acknowledges = False
+    fixture.event("old")
+    fixture.iterate()
+    fixture.store.remove([number for number, _ in fixture.store.after(0, late=False, limit=1)])
+    fixture.iterate_for(10)
+    assert fixture.events() == ["old"]
+    assert fixture.outbox._in_flight == {}
+
+
+def test_an_event_from_memory_is_repeated_from_the_disk_once_it_is_stored(
+    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fixture.connect()
+    fixture.acknowledges = False
+    with monkeypatch.context() as patch:
+        patch.setattr(fixture.store, "put", fail)
+        fixture.event("held")
+        fixture.iterate()
+    fixture.iterate_for(module._SAVE_RETRY_S + 1)
+    assert "held" in fixture.stored()
+    assert all(number > 0 for number in fixture.outbox._in_flight)
+    fixture.acknowledge()
+    fixture.iterate()
+    assert fixture.stored() == []
 
 
 def test_dropped_messages_are_reported_after_reconnection(fixture: OutboxFixture) -> None:

@@ -1,6 +1,7 @@
 """Cloud events are stored like messages of a broker; after a store error they are delivered again."""
 
 import base64
+import contextlib
 import json
 from copy import copy
 from types import SimpleNamespace
@@ -8,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import Measurements, Mode, State, codec, topics
+from device_agent.protocol import Event, Measurements, Mode, State, codec, topics
 from function_app.entrypoints.ingest import cloud_events
 from function_app.ports.tables import StoreError
 from tests.fakes.agent import Robot
@@ -17,6 +18,9 @@ from tests.harness.cloud.cloud import Cloud
 
 def state(tick_ms: int) -> bytes:
     return codec.encode(State(device="arm", at_ms=1, tick_ms=tick_ms, mode=Mode.IDLE, epoch=0))
+
+
+EVENT = Event(id="e1", device="arm", at_ms=1, kind="tested", severity="info", message="x")
 
 
 def tick(cloud: Cloud, robot: Robot) -> int | None:
@@ -114,6 +118,39 @@ class TestQueue:
         bodies = ["{", json.dumps(rule_event(robot.topic("state"), state(1))), json.dumps({"topic": "x"})]
         response = cloud.run(cloud_events.from_queue(without_store(cloud), queued(*bodies)))
         assert response == {"batchItemFailures": [{"itemIdentifier": "m1"}]}
+
+
+class TestConfirmations:
+    @pytest.fixture
+    def confirmed(self, cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bytes]]:
+        """The confirmed messages."""
+        messages: list[tuple[str, bytes]] = []
+
+        async def publish(stored: Any) -> None:
+            messages.extend(stored)
+
+        monkeypatch.setattr(cloud.functions.confirmations, "publish", publish)
+        return messages
+
+    @pytest.mark.parametrize("source", ["grid", "rule", "queue"])
+    @pytest.mark.parametrize("stored", [True, False])
+    def test_stored_and_invalid_messages_are_confirmed(
+        self, cloud: Cloud, robot: Robot, confirmed: list[tuple[str, bytes]], source: str, stored: bool
+    ) -> None:
+        functions = cloud.functions if stored else without_store(cloud)
+        event, invalid = codec.encode(EVENT), b"{"
+        late = topics.device(robot.space, robot.id, "arm", topics.LATE, "joints")
+        messages = [(robot.topic("event"), event), (robot.topic("ack"), invalid), (late, invalid)]
+        with contextlib.suppress(StoreError):
+            if source == "grid":
+                cloud.run(cloud_events.from_event_grid(functions, [cloud_event(*each) for each in messages]))
+            elif source == "queue":
+                bodies = [json.dumps(rule_event(*each)) for each in messages]
+                cloud.run(cloud_events.from_queue(functions, queued(*bodies)))
+            else:
+                for each in reversed(messages):
+                    cloud.run(cloud_events.from_iot_rule(functions, rule_event(*each)))
+        assert sorted(confirmed) == sorted(messages if stored else messages[1:])
 
 
 class TestTelemetry:
