@@ -36,7 +36,7 @@ Acks = Iterable[AckStatus | Ack]
 class Robot:
     """Enrolls with its own key, connects with credentials from the API, and acknowledges signed commands.
 
-    A duplicate command is not executed again; the last ack is repeated.
+    A duplicate command is not executed again; the last ack is repeated. An action that arrives late has expired.
 
     Attributes:
         reports: Returns the acks of a new action. Tests may replace it.
@@ -150,6 +150,11 @@ class Robot:
         self.publish(self.topic(topics.ACK), ack)
         return ack
 
+    def forget(self, command: str) -> None:
+        """Behave as if the command had not arrived."""
+        del self.payloads[command]
+        self.commands = [each for each in self.commands if each.id != command]
+
     def fail(self, command: str, code: str, message: str) -> None:
         self.report(command, AckStatus.FAILED, reason=Reason(code=code, message=message))
 
@@ -176,7 +181,10 @@ class Robot:
         if self.silent or self.link is None:
             return
         action = isinstance(command.request, Task | RunMovement)
-        for each in self.reports(command) if action else (AckStatus.RECEIVED, AckStatus.DONE):
+        reports: Acks = self.reports(command) if action else (AckStatus.RECEIVED, AckStatus.DONE)
+        if action and self.cloud.clock.now_ms() > command.issued_at_ms + command.ttl_ms:
+            reports = (AckStatus.EXPIRED,)
+        for each in reports:
             ack = each if isinstance(each, Ack) else self.ack(command.id, each)
             self._last_acks[command.id] = codec.encode(ack)
             self.link.publish(topic_of_acks, self._last_acks[command.id])

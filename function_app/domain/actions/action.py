@@ -2,17 +2,20 @@
 
 ``created → published → received → accepted → started → done | failed | expired | cancelled``; a waiting action is first
 ``queued``. Steps may be skipped but not reversed. The first terminal status is final.
+
+If the device does not report in time, the action is ``unknown``: the device may have executed it. The device's report
+ends it, also days later.
 """
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Self
 
-_TERMINAL_RANK = 5
+_TERMINAL_RANK = 6
 
 
 class Status(StrEnum):
-    """The progress of an action. The last four values are terminal.
+    """The progress of an action. The last four values are terminal; ``UNKNOWN`` frees the device but is not.
 
     Attributes:
         rank: Position in the order; all terminal states share the last one.
@@ -35,6 +38,7 @@ class Status(StrEnum):
     RECEIVED = "received", 2
     ACCEPTED = "accepted", 3
     STARTED = "started", 4
+    UNKNOWN = "unknown", 5
     DONE = "done", _TERMINAL_RANK
     FAILED = "failed", _TERMINAL_RANK
     EXPIRED = "expired", _TERMINAL_RANK
@@ -44,7 +48,11 @@ class Status(StrEnum):
 RETRY_MS = 1_000
 """Interval after which an unacknowledged command is published again."""
 GRACE_MS = 3_000
-"""Allowed delay of an ack. Then an unacknowledged command counts as expired."""
+"""Allowed delay of an ack. Then the outcome is unknown."""
+ASK_MS = 30_000
+"""Longest interval at which the device is asked for the outcome."""
+JOURNAL_MS = 7 * 24 * 3_600_000
+"""Agents store the outcome of a command for this time. Then the outcome is lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +138,9 @@ def apply_report(action: Action, report: AckReport) -> Action:
     """The action after an ack. Duplicate, late and reordered acks never revert a step."""
     if action.status.terminal or action.status is Status.QUEUED:
         return action  # a queued action was never sent, so this ack is not genuine
+    if report.status is Status.EXPIRED and action.cancel_id:
+        reason = {"code": "cancelled", "message": "Cancelled before the device received it."}
+        report = replace(report, status=Status.CANCELLED, reason=reason)
     times = action.times if report.status.value in action.times else {**action.times, report.status.value: report.at_ms}
     received, first_ms = action.received, action.received.get(report.status.value)
     if report.received_ms and (first_ms is None or report.received_ms < first_ms):
@@ -139,6 +150,7 @@ def apply_report(action: Action, report: AckReport) -> Action:
         same = times is action.times and received is action.received
         return action if same else replace(action, times=times, received=received)
     newest = report.sequence > action.sequence or report.status.terminal
+    doubt = action.status is Status.UNKNOWN and report.status.terminal
     return replace(
         action,
         times=times,
@@ -148,7 +160,7 @@ def apply_report(action: Action, report: AckReport) -> Action:
         progress=report.progress if newest and report.progress is not None else action.progress,
         output=(newest and report.output) or action.output,
         result=(newest and report.result) or action.result,
-        reason=(newest and report.reason) or action.reason,
+        reason=(newest and report.reason) or (None if doubt else action.reason),
     )
 
 
@@ -168,7 +180,7 @@ def give_turn(action: Action, epoch: int, now_ms: int) -> Action:
 
 
 def end(action: Action, status: Status, code: str, message: str, now_ms: int) -> Action:
-    """The action, ended by the cloud; the same object if it has already ended."""
+    """The action, ended by the cloud, or with an unknown outcome; the same object if it has already ended."""
     if action.status.terminal:
         return action
     return replace(
@@ -178,6 +190,8 @@ def end(action: Action, status: Status, code: str, message: str, now_ms: int) ->
 
 def reached(action: Action, status: Status) -> bool:
     """Whether the action has reached ``status``, or can no longer reach it because it has ended."""
+    if action.status is Status.UNKNOWN:
+        return status.value in action.times
     return action.status.terminal or action.status.rank >= status.rank
 
 
@@ -185,36 +199,56 @@ def next_check_ms(action: Action, now_ms: int) -> int:
     """When the timer must check an open action again [ms since 1970]."""
     if action.status is Status.QUEUED:
         return action.queued_until_ms
-    if action.status.rank < Status.RECEIVED.rank and now_ms < action.expires_ms + GRACE_MS:
-        return min(now_ms + RETRY_MS, action.deadline_ms)
+    if action.status is Status.UNKNOWN:
+        since_ms = action.times[Status.UNKNOWN.value]
+        return min(now_ms + min(max(now_ms - since_ms, RETRY_MS), ASK_MS), since_ms + JOURNAL_MS)
+    if action.status.rank < Status.RECEIVED.rank or now_ms >= action.deadline_ms:
+        return now_ms + RETRY_MS
     return action.deadline_ms
 
 
 class NextStep(StrEnum):
-    """What the timer must do with an open action."""
+    """What the timer must do with an open action.
+
+    Attributes:
+        ASK: Publish the command again though it has expired: the device does not start it, but repeats its last ack.
+        DOUBT: The outcome is unknown.
+        LOSE: The outcome will never be known.
+    """
 
     WAIT = "wait"
     PUBLISH = "publish"
     CANCEL = "cancel"
+    ASK = "ask"
+    DOUBT = "doubt"
     EXPIRE = "expire"
     LOSE = "lose"
     ENDED = "ended"
 
 
 def next_step(action: Action, now_ms: int) -> NextStep:
-    """The next step of the timer. An unacknowledged command is republished until its time to live ends.
+    """The next step of the timer. An unacknowledged command is republished; the device drops duplicates by id.
 
-    The device drops duplicates by id. After a cancellation the cancel command is republished instead.
+    After a cancellation the cancel command is republished instead, until the time to live ends. At its deadline the
+    action is cancelled.
     """
     if action.status.terminal:
         return NextStep.ENDED
     if action.status is Status.QUEUED:
         return NextStep.EXPIRE if now_ms >= action.queued_until_ms else NextStep.WAIT
-    if now_ms >= action.deadline_ms:
-        return NextStep.LOSE
-    if action.status.rank < Status.RECEIVED.rank:
-        if now_ms < action.expires_ms:
-            return NextStep.CANCEL if action.cancel_id else NextStep.PUBLISH
-        if now_ms >= action.expires_ms + GRACE_MS:
-            return NextStep.EXPIRE
-    return NextStep.WAIT
+    if action.status is Status.UNKNOWN:
+        lost = now_ms >= action.times[Status.UNKNOWN.value] + JOURNAL_MS
+        return NextStep.LOSE if lost else NextStep.ASK
+    return _step_in_slot(action, now_ms)
+
+
+def _step_in_slot(action: Action, now_ms: int) -> NextStep:
+    acknowledged = action.status.rank >= Status.RECEIVED.rank
+    limit_ms = action.deadline_ms if acknowledged else action.expires_ms
+    if now_ms >= limit_ms + GRACE_MS:
+        return NextStep.DOUBT
+    if now_ms >= limit_ms:
+        return NextStep.CANCEL if acknowledged else NextStep.ASK
+    if acknowledged:
+        return NextStep.WAIT
+    return NextStep.CANCEL if action.cancel_id else NextStep.PUBLISH

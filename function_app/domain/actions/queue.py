@@ -1,6 +1,6 @@
 """The queue of a device: actions that wait for its slot, in order of arrival.
 
-After a failure or a Stop, all waiting actions are cancelled, each with the reason.
+After a failure, an unknown outcome or a Stop, all waiting actions are cancelled, each with the reason.
 """
 
 from collections.abc import Collection
@@ -13,6 +13,7 @@ from function_app.domain.common.problems import Problem
 MAX_QUEUED: Final = 32
 """Maximum number of actions that wait for one device."""
 FAILED_BEFORE = "earlier-failed"
+UNKNOWN_BEFORE = "earlier-unknown"
 STOPPED = "stopped"
 UNPAIRED = "unpaired"
 MOVED = "moved"
@@ -24,6 +25,10 @@ DROPPED: Final = {
     FAILED_BEFORE: (
         Status.CANCELLED,
         "An earlier action failed, so the queued actions were cancelled. Check the device, then start it again.",
+    ),
+    UNKNOWN_BEFORE: (
+        Status.CANCELLED,
+        "It is not known how an earlier action ended, so the queued actions were cancelled. Check the device.",
     ),
     STOPPED: (
         Status.CANCELLED,

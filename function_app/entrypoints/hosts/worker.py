@@ -12,6 +12,8 @@ from function_app.ports.model_compiler import CompilerMissingError
 
 SWEEP_EVERY_S = 1.0
 CHECK_EVERY_S = 0.2
+CATCH_UP_S = 10.0
+"""After a start or a suspension, agents need this time to repeat what the worker has missed [s]."""
 _log = logging.getLogger(__name__)
 
 
@@ -82,9 +84,14 @@ async def _check_models(functions: Functions) -> None:
 
 
 async def _sweep(functions: Functions) -> None:
+    loop = asyncio.get_running_loop()
+    ran_s = current_s = float("-inf")
     while True:
+        if loop.time() - ran_s > CATCH_UP_S / 2:
+            current_s = loop.time() + CATCH_UP_S
+        ran_s = loop.time()
         try:
-            await functions.scheduler.run_due_jobs()
+            await functions.scheduler.run_due_jobs(current=ran_s >= current_s)
         except Exception:  # noqa: BLE001 (the timer continues after a failed run)
             _log.exception("timer")
         await asyncio.sleep(SWEEP_EVERY_S)

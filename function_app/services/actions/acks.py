@@ -66,8 +66,7 @@ class ActionAcks:
         stored = await self._queues.change(ack.id, lambda action: apply_report(action, ack_report))
         if stored is None:
             await self._answer(topic.agent, ack)
-        elif ack.status.terminal and Status.PUBLISHED.value in stored.action.times:
-            # Otherwise the publishing request has not stored the publication yet; it measures the latency later.
+        elif ack.status.terminal and _measurable(stored.action):
             await self._latencies.measured(stored.action, by)
         if by != "mqtt":
             # Last: after a failure the agent receives the command again and repeats the ack.
@@ -150,6 +149,14 @@ class ActionAcks:
             pause_s = min(2 * pause_s, _SLOWEST_POLL_S)
             stored = await self._action_store.get(stored.action.id) or stored
         return stored.action
+
+
+def _measurable(action: Action) -> bool:
+    """Whether the times of an ended action show the latency of the link.
+
+    Without a publication, the publishing request measures it later. A report after an unknown outcome was delayed.
+    """
+    return Status.PUBLISHED.value in action.times and Status.UNKNOWN.value not in action.times
 
 
 def _applied(action: Action, reports: Iterable[AckReport]) -> Action:

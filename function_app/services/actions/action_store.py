@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from function_app.domain.actions.action import Action, Status
-from function_app.domain.actions.queue import FAILED_BEFORE
+from function_app.domain.actions.queue import FAILED_BEFORE, UNKNOWN_BEFORE
 from function_app.domain.common.ids import split_command
 from function_app.domain.control.lease import release
 from function_app.domain.devices.devices import Device
@@ -16,6 +16,8 @@ from function_app.services.storage import records
 
 _PREFIX = "action:"
 _END = "action;"
+_CANCELS_QUEUE = {Status.FAILED: FAILED_BEFORE, Status.UNKNOWN: UNKNOWN_BEFORE}
+"""Status of the action in the slot → why the queued actions are cancelled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +67,9 @@ class ActionStore:
     async def change(
         self, action: str, change: Callable[[Action], Action], *, existing: StoredAction | None = None
     ) -> StoredAction | None:
-        """Change an action by ETag. If it ends, its slot, lease and place in the queue are freed in the same batch.
+        """Change an action by ETag.
+
+        If it ends or its outcome is unknown, its slot, lease and place in the queue are freed in the same batch.
 
         If the result is ``waited_for``, the caller must advance the queue; ``ActionQueues.change`` does both.
         ``change`` returns the same object for no change, and may be called several times. ``existing`` saves a read
@@ -84,7 +88,7 @@ class ActionStore:
                 return stored
             writes = [Write("replace", stored.row.changed(records.to_data(changed)))]
             waited_for = False
-            if changed.status.terminal:
+            if changed.status.terminal or changed.status is Status.UNKNOWN:
                 control = await read_control_rows(self._tables, changed.device)
                 writes += _freed(changed, control)
                 waited_for = not control.queue.without(action).empty
@@ -100,8 +104,8 @@ def _freed(action: Action, control: ControlRows) -> list[Write]:
     queue = control.queue.without(action.id)
     if control.action == action.id:
         writes.append(control.write_slot(action.device, "", action.pairing))
-        if action.status is Status.FAILED:
-            queue = queue.with_all_cancelled(FAILED_BEFORE)
+        if (why := _CANCELS_QUEUE.get(action.status)) is not None:
+            queue = queue.with_all_cancelled(why)
     if queue != control.queue:
         writes.append(control.write_queue(action.device, queue))
     if control.lease is not None and control.lease.action == action.id:

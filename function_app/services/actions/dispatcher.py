@@ -3,16 +3,17 @@
 import msgspec
 
 from device_agent.protocol import RunMovement, Task
-from function_app.domain.actions.action import Action, mark_published
+from function_app.domain.actions.action import ASK_MS, Action, mark_published
 from function_app.domain.actions.queue import DROPPED, KEY_ENDED, SIGNED_OUT, UNPAIRED, UNSHARED
 from function_app.domain.common.ids import split_command, split_device
-from function_app.domain.devices.devices import Agent, Device
+from function_app.domain.common.problems import Problem
+from function_app.domain.devices.devices import Agent, Device, Link
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.identity.api_keys import key_of
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.actions.action_store import ActionStore, StoredAction
-from function_app.services.devices.device_access import DeviceAccess, devices_of
+from function_app.services.devices.device_access import DeviceAccess, devices_of, require_online
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.robot_types.movements import Movements
 from function_app.services.storage import records
@@ -91,6 +92,25 @@ class ActionDispatcher:
         await self._command_sender.send_action(device, await self._command(action), action)
         now_ms = self._clock.now_ms()
         await self._action_store.change(action.id, lambda existing: mark_published(existing, now_ms), existing=stored)
+
+    async def ask(self, action: Action, device: Device) -> None:
+        """Publish the expired command again, unless the device is offline.
+
+        The device never starts it, so the caller's permissions are not checked. It repeats its last ack, or reports
+        that the command has expired.
+
+        Raises:
+            MovementUnavailable: The script is not available.
+            BusUnavailable: The broker did not confirm the command.
+        """
+        now_ms = self._clock.now_ms()
+        _, link = await records.find(self._tables, records.AGENTS, device.agent, "link", Link)
+        try:
+            require_online(link, now_ms)
+        except Problem:
+            return
+        command = await self._command(action)
+        await self._command_sender.send_action(device, command, action, until_ms=now_ms + ASK_MS)
 
     async def _command(self, action: Action) -> Task | RunMovement:
         if action.request["kind"] != "run_movement":

@@ -41,7 +41,14 @@ ORPHAN_MS = 2 * ABANDON_MS
 """Time that a reminder without an action is kept; a start is abandoned before."""
 KEEP_ONCE_MS = DAY_MS
 """Validity of an idempotency key: one day."""
-_ENDING = frozenset({NextStep.ENDED, NextStep.LOSE, NextStep.EXPIRE})
+TIME_LIMIT = "the time limit"
+"""Caller of the cancellation at a deadline, as the action's reason names it."""
+NO_REPORT = (
+    "The device has not reported how the action ended; it may have executed it. Check the device. The result appears "
+    "here when the device reports it."
+)
+LOST = "The device did not report within a week how the action ended. Check the device."
+_ENDING = frozenset({NextStep.ENDED, NextStep.LOSE, NextStep.DOUBT, NextStep.EXPIRE})
 _HEX = "0123456789abcdef"
 
 _log = logging.getLogger(__name__)
@@ -100,12 +107,15 @@ class Scheduler:
             audit_log_.ANCHOR_REMINDER: audit_log.anchor,
         }
 
-    async def run_due_jobs(self) -> None:
-        """Run all due jobs once. Failed jobs are logged and retried in the next run."""
+    async def run_due_jobs(self, *, current: bool = True) -> None:
+        """Run all due jobs once. Failed jobs are logged and retried in the next run.
+
+        ``current``: the ingest has stored all messages that have arrived. Otherwise no outcome becomes unknown.
+        """
         for shard in range(SHARDS):
             for action, note in await self._reminders.due(shard, self._clock.now_ms()):
                 try:
-                    await self._check(action, note)
+                    await self._check(action, note, current=current)
                 except (Problem, BusUnavailable) as error:
                     _log.warning("action %s: %s", action, error)
         await self._delete_expired()
@@ -122,7 +132,7 @@ class Scheduler:
         except BrokerAccessError as error:
             _log.warning("broker access: %s", error)
 
-    async def _check(self, what: str, note: Row) -> None:
+    async def _check(self, what: str, note: Row, *, current: bool) -> None:
         kind, _, target = what.partition(":")
         if kind == queue.REMINDER:
             await self._check_queue(target, note)
@@ -138,9 +148,9 @@ class Scheduler:
             await self._checks[kind](target)
             await self._reminders.cancel(note)
         else:
-            await self._check_action(what, note)
+            await self._check_action(what, note, current=current)
 
-    async def _check_action(self, action_id: str, note: Row) -> None:
+    async def _check_action(self, action_id: str, note: Row, *, current: bool) -> None:
         result = await self._action_store.get(action_id)
         now_ms = self._clock.now_ms()
         if result is None:
@@ -149,11 +159,13 @@ class Scheduler:
             return
         await self._control_events.publish(result.action.device)
         verdict = next_step(result.action, now_ms)
+        if verdict is NextStep.DOUBT and not current:
+            verdict = NextStep.ASK
         if verdict in _ENDING:
             after = await self._ended(result, verdict, now_ms)
             if after is not None and after.status.terminal:
                 await self._schedule_deletion(after)
-            elif after is not None:  # an ack arrived concurrently
+            elif after is not None:  # the outcome is unknown, or an ack arrived concurrently
                 await self._reminders.schedule(action_id, next_check_ms(after, now_ms))
         else:
             # Schedule the next check before this reminder is deleted, so that a kill in between loses no reminder.
@@ -162,6 +174,8 @@ class Scheduler:
                 await self._publish(result, now_ms)
             elif verdict is NextStep.CANCEL:
                 await self._cancel(result.action)
+            elif verdict is NextStep.ASK:
+                await self._ask(result, now_ms)
         await self._reminders.cancel(note)
 
     async def _ended(self, result: StoredAction, verdict: NextStep, now_ms: int) -> Action | None:
@@ -169,16 +183,10 @@ class Scheduler:
         if verdict is NextStep.ENDED:
             return result.action
         if verdict is NextStep.LOSE:
-            await self._cancel(result.action)
-            message = "The device did not report the end of the action before its deadline. Check the device."
-            return await self._end(result, Status.FAILED, "lost", message, now_ms)
-        if result.action.status is Status.QUEUED:
-            return await self._end(result, Status.EXPIRED, "queue-timeout", TIMEOUT, now_ms)
-        if result.action.cancel_id:
-            message = "Cancelled before the device received it."
-            return await self._end(result, Status.CANCELLED, "cancelled", message, now_ms)
-        message = "The device did not receive the command in time. Check that it is online, then start it again."
-        return await self._end(result, Status.EXPIRED, "no-answer", message, now_ms)
+            return await self._end(result, Status.FAILED, "lost", LOST, now_ms)
+        if verdict is NextStep.DOUBT:
+            return await self._end(result, Status.UNKNOWN, "no-report", NO_REPORT, now_ms)
+        return await self._end(result, Status.EXPIRED, "queue-timeout", TIMEOUT, now_ms)
 
     async def _check_queue(self, device: str, note: Row) -> None:
         """Advance a queue after its process may have been killed."""
@@ -226,18 +234,33 @@ class Scheduler:
             return
         try:
             await self._dispatcher.send(result, device)
+        except (MovementUnavailable, PermissionEnded) as error:
+            if Status.PUBLISHED.value in result.action.times:
+                return  # the device may have executed it; it is asked once the command has expired
+            if isinstance(error, PermissionEnded):
+                status, message = DROPPED[error.why]
+                await self._end(result, status, error.why, message, now_ms)
+            else:
+                message = "The movement's script changed before the command was sent. Start it again."
+                await self._end(result, Status.FAILED, "movement-changed", message, now_ms)
+
+    async def _ask(self, result: StoredAction, now_ms: int) -> None:
+        """Ask the device for the outcome."""
+        device = await self._dispatcher.device(result.action)
+        if device is None:
+            message = "The device was unpaired before it reported how the action ended."
+            await self._end(result, Status.FAILED, "lost", message, now_ms)
+            return
+        try:
+            await self._dispatcher.ask(result.action, device)
         except MovementUnavailable:
-            message = "The movement's script changed before the command was sent. Start it again."
-            await self._end(result, Status.FAILED, "movement-changed", message, now_ms)
-        except PermissionEnded as ended:
-            status, message = DROPPED[ended.why]
-            await self._end(result, status, ended.why, message, now_ms)
+            _log.info("action %s: its script was deleted, so the device is not asked for the outcome", result.action.id)
 
     async def _cancel(self, action: Action) -> None:
         device = await self._dispatcher.device(action)
         if device is not None:
-            order = CancelAction(action=action.id)
-            await self._command_sender.try_send(device, order, caller=action.caller, epoch=action.epoch)
+            order, caller = CancelAction(action=action.id), action.caller if action.cancel_id else TIME_LIMIT
+            await self._command_sender.try_send(device, order, caller=caller, epoch=action.epoch)
 
     async def _delete_expired(self) -> None:
         """Delete expired claim codes and sign-in links, a limited number per run."""

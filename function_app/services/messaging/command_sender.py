@@ -64,8 +64,14 @@ class CommandSender:
         expires_ms = command.issued_at_ms + (STOP_LIFETIME_MS if stop else command.ttl_ms)
         return SignedCommand(command.id, payload, expires_ms, first=stop)
 
-    async def send_action(self, device: Device, request: Request, action: Action) -> None:
+    async def send_action(self, device: Device, request: Request, action: Action, *, until_ms: int = 0) -> None:
         """Sign and publish the command of a stored action.
+
+        Args:
+            device: The device.
+            request: What to run.
+            action: The action.
+            until_ms: A polling agent can fetch the command until then [ms since 1970]; 0: until it expires.
 
         Raises:
             BusUnavailable: The broker did not confirm the command.
@@ -79,7 +85,8 @@ class CommandSender:
             issued_ms=action.issued_ms,
             ttl_ms=action.ttl_ms,
         )
-        await self._delivery.send(device, await self.sign(command))
+        signed = await self.sign(command)
+        await self._delivery.send(device, signed._replace(expires_ms=until_ms or signed.expires_ms))
 
     async def send(self, device: Device, request: Request, *, caller: str, epoch: int) -> str:
         """Sign and send a short-lived command; return its id. A cancel also withdraws an action not yet fetched.

@@ -59,13 +59,23 @@ class Mailbox:
     ) -> None:
         """Store a command for the device's agent until ``expires_ms`` [ms since 1970]. Idempotent by command id.
 
+        A stored command is only replaced by one that expires later.
+
         ``first``: returned before all others, as a Stop.
         """
         entry = MailboxEntry(command, topic, payload, expires_ms, device.pairing)
         await self._schedule_deletion(device.agent, expires_ms)
-        with contextlib.suppress(Conflict):
-            await self._tables.create(
-                records.MAILBOX, Row(device.agent, _key(command, first=first), records.to_data(entry))
+        key = _key(command, first=first)
+        try:
+            await self._tables.create(records.MAILBOX, Row(device.agent, key, records.to_data(entry)))
+        except Conflict:
+            await records.upsert(
+                self._tables,
+                records.MAILBOX,
+                device.agent,
+                key,
+                lambda existing: None if existing is not None and existing.expires_ms >= expires_ms else entry,
+                MailboxEntry,
             )
         self._notify(device.agent)
 

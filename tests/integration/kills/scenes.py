@@ -199,12 +199,18 @@ async def rows_of(functions: Functions, table: str, partition: str) -> dict[str,
             return rows
 
 
-async def settle(functions: Functions) -> None:
-    """Advance time and run the timer until every time limit has passed."""
+async def settle(functions: Functions, scenes: list[Scene]) -> None:
+    """Advance time and run the timer until every time limit has passed; then the devices report unknown outcomes."""
     clock = cast("SetClock", functions.clock)
-    for step_s in (*([1.0] * (TIMEOUT_S + QUEUE_S + 4)), *([ORPHAN_MS / 2000 + 1] * 3)):
+    for step_s in (*([1.0] * (TIMEOUT_S + QUEUE_S + 12)), *([ORPHAN_MS / 2000 + 1] * 3)):
         clock.advance(step_s)
         await functions.scheduler.run_due_jobs()
+    for scene in scenes:
+        for data in (await rows_of(functions, records.CONTROL, scene.device)).values():
+            if data.get("status") == "unknown":
+                await report(functions, data["id"], AckStatus.EXPIRED)
+    clock.advance(ORPHAN_MS / 1000)
+    await functions.scheduler.run_due_jobs()
     reminders = [key for shard in range(SHARDS) for key in await rows_of(functions, records.PENDING, str(shard))]
     # A longer lease has a reminder of its end; an audit chain has an hourly one.
     reminders = [key for key in reminders if ":anchor:" not in key]
@@ -215,7 +221,7 @@ async def settle(functions: Functions) -> None:
 
 async def check_scenes(functions: Functions, place: Place, scenes: list[Scene]) -> None:
     """Assert that no action is open, that each sent command is stored, and that every robot can be used."""
-    await settle(functions)
+    await settle(functions, scenes)
     sent = commands_sent(place)
     for command, payloads in sent.items():
         assert len(payloads) == 1, f"{command} was sent with different contents"

@@ -23,14 +23,25 @@ class ReasonOut(Response, frozen=True, kw_only=True):
 class ActionOut(Response, frozen=True, kw_only=True):
     """An action. ``times``: ``<status>_ms`` → milliseconds since 1970. ``queue_position``: 1 is next.
 
-    ``epoch`` is 0 while a queued action has no lease.
+    ``epoch`` is 0 while a queued action has no lease. Status ``unknown``: the device has not reported the outcome in
+    time and may have executed the action. The device is free, and the action ends when the device reports.
     """
 
     id: str
     device: str
     request: dict[str, Any]
     status: Literal[
-        "queued", "created", "published", "received", "accepted", "started", "done", "failed", "expired", "cancelled"
+        "queued",
+        "created",
+        "published",
+        "received",
+        "accepted",
+        "started",
+        "unknown",
+        "done",
+        "failed",
+        "expired",
+        "cancelled",
     ]
     queue_position: int | None
     epoch: int

@@ -3,7 +3,7 @@ import type { Control } from "../control/model";
 import { actionUnavailableReason } from "../devices";
 import type { DeviceStore } from "../devices/model";
 import { useState } from "preact/hooks";
-import { ended, type ActionRunner, type Run } from "./model/action-runner";
+import { ended, released, type ActionRunner, type Run } from "./model/action-runner";
 import { format } from "../../shared/i18n/format";
 import { describeRequest, texts } from "./texts";
 import "./run-status.css";
@@ -20,7 +20,8 @@ export function RunStatusPanel({ device, control, actions }: RunStatusProps) {
   const newest = actions.run.value;
   const run = newest === null || newest.key === dismissed ? null : newest;
   const reported = device.live.value ? (device.state.value?.action ?? null) : null;
-  const ownRunning = run !== null && !ended(run);
+  // A run with an unknown outcome may still be running, if the device says so.
+  const ownRunning = run !== null && (!released(run) || reported?.id === run.id);
   const otherAction = !ownRunning && reported !== null && reported.id !== newest?.id ? reported : null;
   const visible = run !== null || otherAction !== null;
   const cancel = (): void => void actions.cancel(otherAction?.id ?? null).then(setError);
@@ -37,7 +38,7 @@ export function RunStatusPanel({ device, control, actions }: RunStatusProps) {
             {texts.cancel}
           </button>
         )}
-        {run !== null && ended(run) && (
+        {run !== null && released(run) && (
           <>
             <UndoButton device={device} control={control} actions={actions} run={run} />
             <button type="button" class="plain" onClick={() => setDismissed(run.key)}>
@@ -72,7 +73,7 @@ export function RunSteps({ run }: { run: Run }) {
           </li>
         ))}
       </ol>
-      {run.progress !== null && !ended(run) && <progress value={run.progress} max={1} aria-label={name} />}
+      {run.progress !== null && !released(run) && <progress value={run.progress} max={1} aria-label={name} />}
       {run.reason !== "" && <p class={run.status === "done" ? "" : "field-error"}>{run.reason}</p>}
       {run.status === "unanswered" && <p class="field-error">{texts.unanswered}</p>}
     </>
@@ -83,7 +84,7 @@ export function RunSteps({ run }: { run: Run }) {
 function UndoButton({ device, control, actions, run }: RunStatusProps & { run: Run }) {
   const { undo } = run;
   const started = run.steps.some(({ status }) => status === "started");
-  if (undo === null || !started) return null;
+  if (undo === null || !started || !ended(run)) return null;
   const disabledReason = actionUnavailableReason(device, control);
   return (
     <button

@@ -20,6 +20,7 @@ export const texts = {
     sent: "sent",
     accepted: "accepted",
     started: "started",
+    unknown: "outcome unknown",
     done: "done",
     failed: "failed",
     expired: "expired",

@@ -55,7 +55,7 @@ function endText({ status, request, reason }: TraceLine): string {
 
 function Row({ line }: { line: TraceLine }) {
   const of = (status: TraceStatus): Step<TraceStatus> | undefined => line.steps.find((step) => step.status === status);
-  const end = line.steps.find(({ status }) => !FIRST.has(status));
+  const end = line.steps.findLast(({ status }) => !FIRST.has(status));
   const data = Object.fromEntries(COLUMNS.map((column) => [`data-${column}`, of(column)?.afterMs.toFixed(1) ?? ""]));
   return (
     <tr

@@ -1,5 +1,5 @@
 /** The movements that a robot can run, with their parameters. */
-import { type ActionRunner, ended } from "../actions/model";
+import { type ActionRunner, released } from "../actions/model";
 import type { Control } from "../control/model";
 import type { DeviceStore } from "../devices/model";
 import { Card } from "../../shared/ui/card";
@@ -44,7 +44,7 @@ export function MovementsCard({ api, device, control, actions, account }: Moveme
   }, [api, id, isViewer, attempt]);
 
   const run = actions.run.value;
-  const running = (run !== null && !ended(run)) || (device.live.value && device.state.value?.mode === "action");
+  const running = (run !== null && !released(run)) || (device.live.value && device.state.value?.mode === "action");
   const blocked = running || device.stopped.value || device.reach.value === "offline";
   const start = (name: string, parameters: Parameters): void =>
     void actions.start({ kind: "run_movement", name, parameters }, control.epoch);

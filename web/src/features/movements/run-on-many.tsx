@@ -1,7 +1,7 @@
 /** Runs one movement on several robots, and shows each run. */
 import type { Account } from "../../shared/api/types";
 import { RunSteps } from "../actions";
-import { ended } from "../actions/model";
+import { released } from "../actions/model";
 import { StopBanner, StopOutcomes } from "../control";
 import { actionUnavailableReason, ReachChip } from "../devices";
 import type { DeviceSession } from "../control/model";
@@ -226,5 +226,5 @@ function RunRow({ session }: { session: DeviceSession }) {
 }
 
 function isRunning(run: DeviceSession["actions"]["run"]["value"]): boolean {
-  return run !== null && !ended(run);
+  return run !== null && !released(run);
 }

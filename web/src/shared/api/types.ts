@@ -97,7 +97,8 @@ export interface GrantedLease {
   streaming: boolean;
 }
 
-export type ActionStatus = AckStatus | "queued" | "created" | "published";
+/** `unknown`: the device has not reported the outcome in time; its report ends the action. */
+export type ActionStatus = AckStatus | "queued" | "created" | "published" | "unknown";
 
 export interface Action {
   id: string;

@@ -1,6 +1,6 @@
 /** Stop, actions and command traces. */
 import { beforeEach, describe, expect, it } from "vitest";
-import { ActionRunner } from "../../../src/features/actions/model/action-runner";
+import { ActionRunner, ended, released } from "../../../src/features/actions/model/action-runner";
 import { Control, LEASE_MS } from "../../../src/features/control/model/lease";
 import { CommandTrace } from "../../../src/features/control/model/command-trace";
 import { StopSwitch } from "../../../src/features/control/model/stop";
@@ -157,6 +157,18 @@ describe("an action", () => {
     await actions.cancel(null);
     await pass(0);
     expect(actions.run.value?.status).toBe("cancelled");
+  });
+
+  it("with an unknown outcome frees the device, and ends when the robot reports", async () => {
+    const actions = runner();
+    const unknown = { ...action("unknown"), reason: { code: "no-report", message: "Not reported." } };
+    server.on("GET /actions/x1", () => ok(unknown));
+    const run = await actions.startAndWait(WAVE, { epoch: null });
+    expect(run).toMatchObject({ status: "unknown", reason: "Not reported." });
+    expect([released(run), ended(run)]).toEqual([true, false]);
+    ack("done");
+    expect(actions.run.value).toMatchObject({ status: "done", reason: "" });
+    expect(actions.run.value?.steps.map(({ status }) => status)).toEqual(["sent", "started", "unknown", "done"]);
   });
 
   it("reports why it was rejected", async () => {

@@ -9,7 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from function_app.domain.actions.action import (
+    ASK_MS,
     GRACE_MS,
+    JOURNAL_MS,
     RETRY_MS,
     AckReport,
     Action,
@@ -70,7 +72,7 @@ def test_acks_in_any_order_have_the_same_result(order: tuple[int, ...]) -> None:
 reports_ = st.lists(
     st.builds(
         AckReport,
-        status=st.sampled_from([status for status in Status if status.rank >= Status.RECEIVED.rank]),
+        status=st.sampled_from((*LIFE[:3], *ENDS)),
         sequence=st.integers(min_value=0, max_value=6),
         at_ms=st.integers(min_value=0, max_value=10),
         progress=st.none() | st.floats(min_value=0, max_value=1),
@@ -142,34 +144,78 @@ def test_waiting_ends_when_the_status_is_reached_or_impossible() -> None:
     [
         (Status.CREATED, 0, NextStep.PUBLISH),
         (Status.PUBLISHED, 9_999, NextStep.PUBLISH),
-        (Status.PUBLISHED, 10_000, NextStep.WAIT),
-        (Status.PUBLISHED, 10_000 + GRACE_MS, NextStep.EXPIRE),
+        (Status.PUBLISHED, 10_000, NextStep.ASK),
+        (Status.PUBLISHED, 10_000 + GRACE_MS, NextStep.DOUBT),
         (Status.RECEIVED, 10_000 + GRACE_MS, NextStep.WAIT),
         (Status.STARTED, 59_999, NextStep.WAIT),
-        (Status.STARTED, 60_000, NextStep.LOSE),
-        (Status.CREATED, 60_000, NextStep.LOSE),
+        (Status.STARTED, 60_000, NextStep.CANCEL),
+        (Status.STARTED, 60_000 + GRACE_MS, NextStep.DOUBT),
+        (Status.CREATED, 60_000, NextStep.DOUBT),
     ],
 )
-def test_the_timer_resends_commands_then_ends_them(status: Status, after_ms: int, expected: NextStep) -> None:
+def test_the_timer_resends_commands_then_asks_for_outcomes(status: Status, after_ms: int, expected: NextStep) -> None:
     assert next_step(replace(NEW, status=status), NEW.created_ms + after_ms) is expected
 
 
 def test_a_cancelled_action_is_not_republished() -> None:
     cancelled = replace(NEW, status=Status.PUBLISHED, cancel_id="x")
     assert next_step(cancelled, NEW.created_ms + 5_000) is NextStep.CANCEL
-    assert next_step(cancelled, NEW.created_ms + 10_000 + GRACE_MS) is NextStep.EXPIRE
+    assert next_step(cancelled, NEW.created_ms + 10_000) is NextStep.ASK
+    expired = apply_report(cancelled, AckReport(Status.EXPIRED, 1, 5, reason={"code": "expired", "message": "late"}))
+    assert (expired.status, expired.reason and expired.reason["code"]) == (Status.CANCELLED, "cancelled")
+    assert expired.times == {"cancelled": 5}
 
 
 @given(
-    st.sampled_from([status for status in Status if not status.terminal][1:]),
-    st.integers(min_value=0, max_value=59_999),
+    st.sampled_from((Status.CREATED, Status.PUBLISHED, *LIFE[:3])),
+    st.integers(min_value=0, max_value=60_000 + GRACE_MS),
 )
-def test_the_next_check_is_later_and_not_after_the_deadline(status: Status, after_ms: int) -> None:
+def test_the_next_check_is_later_and_not_after_the_next_step(status: Status, after_ms: int) -> None:
     now_ms = NEW.created_ms + after_ms
     due_ms = next_check_ms(replace(NEW, status=status), now_ms)
-    assert now_ms < due_ms <= NEW.deadline_ms
-    if status.rank < Status.RECEIVED.rank and now_ms < NEW.expires_ms:
+    assert now_ms < due_ms
+    if status.rank < Status.RECEIVED.rank or now_ms >= NEW.deadline_ms:
         assert due_ms <= now_ms + RETRY_MS
+    else:
+        assert due_ms == NEW.deadline_ms
+
+
+def unknown(*statuses: Status) -> Action:
+    return end(applied(NEW, life(*statuses)), Status.UNKNOWN, "no-report", "Not reported.", 2_000_000)
+
+
+@pytest.mark.parametrize("last", ENDS)
+@pytest.mark.parametrize("before", [(), LIFE[:2], LIFE[:3]])
+def test_a_report_ends_an_unknown_outcome(before: tuple[Status, ...], last: Status) -> None:
+    doubtful = unknown(*before)
+    assert not doubtful.status.terminal
+    ended = apply_report(doubtful, AckReport(last, 9, 3_000_000))
+    assert (ended.status, ended.reason) == (last, None)
+    assert ended.times == doubtful.times | {last.value: 3_000_000}
+    assert end(ended, Status.FAILED, "lost", "x", 4_000_000) is ended
+
+
+def test_progress_does_not_end_an_unknown_outcome() -> None:
+    shown = apply_report(unknown(), AckReport(Status.STARTED, 3, 3_000_000, progress=0.5))
+    assert (shown.status, shown.progress) == (Status.UNKNOWN, 0.5)
+    assert shown.reason == {"code": "no-report", "message": "Not reported."}
+    assert "started" in shown.times
+
+
+def test_with_an_unknown_outcome_waiting_continues_for_what_has_not_happened() -> None:
+    assert not reached(unknown(), Status.STARTED)
+    assert not reached(unknown(*LIFE[:3]), Status.DONE)
+    assert reached(unknown(*LIFE[:3]), Status.STARTED)
+
+
+@given(st.integers(min_value=0, max_value=JOURNAL_MS - 1))
+def test_the_device_is_asked_ever_less_often_and_the_outcome_is_lost_with_its_journal(after_ms: int) -> None:
+    doubtful = unknown()
+    now_ms = 2_000_000 + after_ms
+    assert next_step(doubtful, now_ms) is NextStep.ASK
+    pause_ms = next_check_ms(doubtful, now_ms) - now_ms
+    assert 0 < pause_ms <= min(ASK_MS, max(RETRY_MS, after_ms))
+    assert next_step(doubtful, 2_000_000 + JOURNAL_MS) is NextStep.LOSE
 
 
 def test_the_earliest_reception_of_an_ack_counts() -> None:

@@ -25,6 +25,9 @@ ENDS = (*STARTS, AckStatus.DONE)
 def check_settled(cloud: Cloud, robot: Robot, anna: Person) -> None:
     """Let time pass and check that nothing is left open."""
     pass_time(cloud, 20)
+    for key, data in control_rows(cloud, robot.device).items():
+        if key.startswith("action:") and data["status"] == "unknown":
+            robot.report(data["id"], AckStatus.FAILED)
     pass_time(cloud, 10 + ORPHAN_MS / 1000, step_s=15)
     pass_time(cloud, 400, step_s=200)
     rows = control_rows(cloud, robot.device)

@@ -1,10 +1,13 @@
 """The timer resends unanswered commands, ends lost actions and deletes expired rows."""
 
 import asyncio
+from unittest import mock
 
 import pytest
 
 from device_agent.protocol import AckStatus, CancelAction, RunMovement
+from function_app.domain.actions.action import JOURNAL_MS
+from function_app.services.maintenance.scheduler import TIME_LIMIT
 from tests.fakes.agent import Robot
 from tests.fakes.broker import MemoryBroker
 from tests.fixtures.cloud import Crashing
@@ -57,29 +60,111 @@ def test_a_script_is_resent_as_it_was_at_the_start(cloud: Cloud, anna: Person, r
     assert command.request.source == "robot.home()"
 
 
-def test_an_unacknowledged_action_expires(cloud: Cloud, anna: Person, robot: Robot, unanswered: str) -> None:
+def test_an_unacknowledged_action_is_unknown_until_the_device_reports(
+    cloud: Cloud, anna: Person, robot: Robot, unanswered: str
+) -> None:
     pass_time(cloud, 4.5, step_s=0.5)
     assert anna.action(unanswered)["status"] == "published", "an ack may still arrive"
     pass_time(cloud, 1, step_s=0.5)
     shown = anna.action(unanswered)
-    assert (shown["status"], shown["reason"]["code"]) == ("expired", "no-answer")
-    assert "expired_ms" in shown["times"]
+    assert (shown["status"], shown["reason"]["code"]) == ("unknown", "no-report")
+    assert "unknown_ms" in shown["times"]
     assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
     robot.silent = False
     assert anna.start(robot.device, wait_ms=10_000).status_code == 200
     robot.report(unanswered, AckStatus.DONE)
-    assert anna.action(unanswered)["status"] == "expired", "the first terminal status remains"
+    shown = anna.action(unanswered)
+    assert (shown["status"], shown["reason"]) == ("done", None)
+    robot.fail(unanswered, "held", "The arm had to hold.")
+    assert anna.action(unanswered)["status"] == "done", "the first terminal status remains"
 
 
-def test_an_action_beyond_its_timeout_is_lost_and_cancelled(cloud: Cloud, anna: Person, robot: Robot) -> None:
+def test_a_device_that_never_received_the_command_reports_it_as_expired(
+    cloud: Cloud, anna: Person, robot: Robot, unanswered: str
+) -> None:
+    robot.forget(unanswered)
+    robot.silent = False
+    cloud.clock.advance(2)
+    pass_time(cloud, 1.1)
+    assert anna.action(unanswered)["status"] == "expired"
+    assert len(robot.payloads[unanswered]) == 1
+
+
+@pytest.mark.parametrize("online", [True, False])
+def test_only_an_online_device_is_asked_for_an_unknown_outcome(
+    cloud: Cloud, anna: Person, robot: Robot, unanswered: str, online: bool
+) -> None:
+    pass_time(cloud, 6)
+    robot.publish_presence(online=online)
+    copies = len(robot.payloads[unanswered])
+    pass_time(cloud, 100, step_s=10)
+    assert (len(robot.payloads[unanswered]) > copies) is online
+    assert len(set(robot.payloads[unanswered])) == 1
+    assert anna.action(unanswered)["status"] == "unknown"
+
+
+def test_an_unknown_outcome_is_lost_after_a_week(cloud: Cloud, anna: Person, robot: Robot, unanswered: str) -> None:
+    pass_time(cloud, 6)
+    robot.publish_presence(online=False)
+    cloud.clock.advance(JOURNAL_MS / 1000)
+    anna = cloud.sign_in("anna")
+    pass_time(cloud, 2)
+    shown = anna.action(unanswered)
+    assert (shown["status"], shown["reason"]["code"]) == ("failed", "lost")
+
+
+@pytest.mark.parametrize("gone", ["permission", "movement"])
+def test_an_unknown_outcome_remains_without_permission_or_script(
+    cloud: Cloud, anna: Person, robot: Robot, gone: str
+) -> None:
+    robot.silent = True
+    anna.put(MINE, {"source": "robot.home()"})
+    action = anna.start(robot.device, request={"kind": "run_movement", "name": "mine"}, ttl_ms=2_000).json()["id"]
+    if gone == "permission":
+        anna.post("/auth/sign-out")
+        anna = cloud.sign_in("anna")
+    else:
+        robot_type_rows = cloud.functions.movements
+        with mock.patch.object(robot_type_rows, "pinned_source", mock.AsyncMock(return_value=None)):
+            pass_time(cloud, 10)
+    pass_time(cloud, 10)
+    assert anna.action(action)["status"] == "unknown"
+    robot.report(action, AckStatus.DONE)
+    assert anna.action(action)["status"] == "done"
+
+
+def test_unpairing_ends_an_unknown_outcome(cloud: Cloud, anna: Person, robot: Robot, unanswered: str) -> None:
+    pass_time(cloud, 6)
+    assert anna.action(unanswered)["status"] == "unknown"
+    assert anna.delete(f"/agents/{robot.id}").status_code == 204
+    pass_time(cloud, 60, step_s=5)
+    row = control_rows(cloud, robot.device)[f"action:{unanswered.rpartition('-')[2]}"]
+    assert (row["status"], row["reason"]["code"]) == ("failed", "lost")
+
+
+def test_no_outcome_becomes_unknown_while_the_ingest_is_behind(
+    cloud: Cloud, anna: Person, robot: Robot, unanswered: str
+) -> None:
+    for _ in range(20):
+        cloud.clock.advance(1)
+        cloud.run(cloud.functions.scheduler.run_due_jobs(current=False))
+    assert anna.action(unanswered)["status"] == "published"
+    assert len(robot.payloads[unanswered]) > 15, "it asks the device"
+
+
+def test_an_action_beyond_its_timeout_is_cancelled_then_unknown(cloud: Cloud, anna: Person, robot: Robot) -> None:
     action = anna.start(robot.device, wait_ms=10_000, timeout_ms=6_000).json()["id"]
     pass_time(cloud, 5)
     assert anna.action(action)["status"] == "started"
     pass_time(cloud, 1.5)
-    shown = anna.action(action)
-    assert (shown["status"], shown["reason"]["code"]) == ("failed", "lost")
-    assert [command.request for command in robot.received(CancelAction)] == [CancelAction(action=action)]
+    assert anna.action(action)["status"] == "started"
+    cancelled = [command for command in robot.received(CancelAction) if command.request == CancelAction(action=action)]
+    assert {command.caller for command in cancelled} == {TIME_LIMIT}
+    pass_time(cloud, 3)
+    assert anna.action(action)["status"] == "unknown"
     assert anna.start(robot.device, wait_ms=10_000).status_code == 200
+    robot.report(action, AckStatus.CANCELLED)
+    assert anna.action(action)["status"] == "cancelled"
 
 
 def test_a_cancelled_action_is_not_resent(cloud: Cloud, anna: Person, robot: Robot, unanswered: str) -> None:
@@ -87,9 +172,10 @@ def test_a_cancelled_action_is_not_resent(cloud: Cloud, anna: Person, robot: Rob
     pass_time(cloud, 1.1)
     assert len(robot.received(CancelAction)) == 2, "the cancel command is resent"
     assert len(robot.payloads[unanswered]) == 1
+    robot.forget(unanswered)
+    robot.silent = False
     pass_time(cloud, 5)
     assert anna.action(unanswered)["status"] == "cancelled"
-    robot.silent = False
     assert anna.start(robot.device, wait_ms=10_000).status_code == 200
 
 
@@ -111,8 +197,9 @@ def test_concurrent_timers_do_each_job_once(cloud: Cloud, anna: Person, robot: R
     for _ in range(8):
         cloud.clock.advance(1)
         cloud.run(together())
-    assert anna.action(unanswered)["status"] == "expired"
+    assert anna.action(unanswered)["status"] == "unknown"
     assert len(set(robot.payloads[unanswered])) == 1
+    robot.report(unanswered, AckStatus.DONE)
     pass_time(cloud, 400, step_s=200)
     assert reminders(cloud) == []
 

@@ -14,13 +14,14 @@ import { undoRequestOf } from "./undo-request";
 import type { AnyRequest } from "../../../shared/api/action-requests";
 
 /**
- * `sent`: requested, no response yet. `refused`: rejected by the cloud. `unanswered`: the cloud was unreachable, so it
- * is unknown whether the device received the request.
+ * `sent`: requested, no response yet. `unknown`: the device has not reported the outcome in time. `refused`: rejected by
+ * the cloud. `unanswered`: the cloud was unreachable, so it is unknown whether the device received the request.
  */
 export type RunStatus =
   | "sent"
   | "accepted"
   | "started"
+  | "unknown"
   | "done"
   | "failed"
   | "expired"
@@ -67,12 +68,13 @@ const RANK: Readonly<Record<RunStatus, number>> = {
   sent: 0,
   accepted: 1,
   started: 2,
-  done: 3,
-  failed: 3,
-  expired: 3,
-  cancelled: 3,
-  refused: 3,
-  unanswered: 3,
+  unknown: 3,
+  done: 4,
+  failed: 4,
+  expired: 4,
+  cancelled: 4,
+  refused: 4,
+  unanswered: 4,
 };
 const MAX_RUNS = 20;
 const POLL_MS = 10_000;
@@ -89,6 +91,11 @@ function runStatusOf(status: ActionStatus): RunStatus {
 
 export function ended({ status }: { status: RunStatus }): boolean {
   return RANK[status] === RANK.done;
+}
+
+/** Whether the run no longer occupies its device. */
+export function released({ status }: { status: RunStatus }): boolean {
+  return RANK[status] >= RANK.unknown;
 }
 
 export class ActionRunner {
@@ -116,9 +123,9 @@ export class ActionRunner {
     return this.#track(request, { epoch: null, response }).firstResponse;
   }
 
-  /** Starts an action and waits for the requested status or the end. */
+  /** Starts an action and waits for the requested status, the end or an unknown outcome. */
   async startAndWait(request: AnyRequest, options: ActionOptions): Promise<Run> {
-    return this.#track(request, options).waitFor(options.waitFor ?? "done");
+    return this.#track(request, options).waitFor(options.waitFor === "started" ? "started" : "unknown");
   }
 
   /** Cancels the newest run of this page, or action `other` of another caller. Returns the error, or "". */
@@ -178,11 +185,11 @@ class TrackedRun {
     this.run = this.#run;
     this.firstResponse = this.#start(options);
     if (options.epoch !== null) return;
-    void this.waitFor("done").then(() => setTimeout(() => void this.#refreshLease(), LEASE_REFRESH_DELAY_MS));
+    void this.waitFor("unknown").then(() => setTimeout(() => void this.#refreshLease(), LEASE_REFRESH_DELAY_MS));
   }
 
-  /** The run when it reaches the status or ends. */
-  waitFor(status: "started" | "done"): Promise<Run> {
+  /** The run when it has started, or when it no longer occupies its device. */
+  waitFor(status: "started" | "unknown"): Promise<Run> {
     return new Promise((resolve) => {
       const unsubscribe = effect(() => {
         const run = this.#run.value;
@@ -262,7 +269,8 @@ class TrackedRun {
     const run = this.#run.value;
     const result = Object.keys(ack.result).length > 0 ? ack.result : run.result;
     const update = { output: longer(ack.output, run.output), progress: ack.progress ?? run.progress, result };
-    this.#advance(runStatusOf(ack.status), { reason: ack.reason?.message ?? run.reason, ...update }, "device", at);
+    const before = run.status === "unknown" ? "" : run.reason;
+    this.#advance(runStatusOf(ack.status), { reason: ack.reason?.message ?? before, ...update }, "device", at);
   }
 
   /** The status never moves backwards and the first terminal status stays; a late step is inserted in order. */

@@ -1,1 +1,1 @@
-export { type ActionOptions, ActionRunner, type StepSource, ended, type Run, type RunStatus, type Step } from "./action-runner";
+export { type ActionOptions, ActionRunner, type StepSource, ended, released, type Run, type RunStatus, type Step } from "./action-runner";
