@@ -102,6 +102,8 @@ def test_an_agent_of_one_version_works_with_a_server_of_another(
     done = person.post(f"{path}/actions", json={"request": MOVE, "wait_for": "done", "wait_ms": 20_000}).json()
     assert done["status"] == "done", done
     assert person.post(f"{path}/stop").json()["confirmed"] is True
+    wait_until(lambda: not _undelivered(tmp_path / "agent"), "the delivery of all acks: confirmed, or by PUBACK")
+    assert "rejected" not in program.stderr()
 
 
 @pytest.mark.parametrize(("first", "second"), [("released", "current"), ("current", "released")])
@@ -143,6 +145,11 @@ def test_a_clone_without_the_release_is_reported_with_the_remedy(tmp_path: Path,
 def _store(home: Path) -> Iterator[sqlite3.Connection]:
     with contextlib.closing(sqlite3.connect(home / "tables.sqlite", isolation_level=None)) as store:
         yield store
+
+
+def _undelivered(agent: Path) -> list[object]:
+    with contextlib.closing(sqlite3.connect(f"file:{agent}/journal.db?mode=ro", uri=True)) as journal:
+        return journal.execute("SELECT id FROM commands WHERE delivered = 0").fetchall()
 
 
 def _answers(person: httpx.Client) -> bool:

@@ -32,8 +32,9 @@ CREATE TABLE IF NOT EXISTS counters (name TEXT PRIMARY KEY, value INTEGER NOT NU
 """
 _CACHE_KB = 256
 """Rows are accessed individually by key, so a larger cache would only use memory [kB]."""
-_KEEP_MS = 7 * 24 * 3600 * 1000
-"""Commands are stored for a week, longer than any ``ttl_ms`` (at most a day), so that none runs twice [ms]."""
+_KEEP_MS = 8 * 24 * 3600 * 1000
+"""Commands are stored for this time [ms]: longer than any ``ttl_ms`` (at most a day), so that none runs twice, and than
+the week in which the cloud asks for their outcome."""
 
 
 class JournalError(Exception):
@@ -58,7 +59,7 @@ class Journal:
         self._database: sqlite3.Connection | None = None
 
     def open(self, *, now_ms: int) -> None:
-        """Open or create the file, and delete commands older than a week.
+        """Open or create the file, and delete commands older than eight days.
 
         Raises:
             JournalError: The file cannot be read, or is not a journal.

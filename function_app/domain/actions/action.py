@@ -52,7 +52,10 @@ GRACE_MS = 3_000
 ASK_MS = 30_000
 """Longest interval at which the device is asked for the outcome."""
 JOURNAL_MS = 7 * 24 * 3_600_000
-"""Agents store the outcome of a command for this time. Then the outcome is lost."""
+"""Agents store the outcome of a command at least for this time after its issue. Then the outcome is lost.
+
+Without this limit, an agent that has deleted the outcome would report an executed command as expired.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +204,7 @@ def next_check_ms(action: Action, now_ms: int) -> int:
         return action.queued_until_ms
     if action.status is Status.UNKNOWN:
         since_ms = action.times[Status.UNKNOWN.value]
-        return min(now_ms + min(max(now_ms - since_ms, RETRY_MS), ASK_MS), since_ms + JOURNAL_MS)
+        return min(now_ms + min(max(now_ms - since_ms, RETRY_MS), ASK_MS), action.issued_ms + JOURNAL_MS)
     if action.status.rank < Status.RECEIVED.rank or now_ms >= action.deadline_ms:
         return now_ms + RETRY_MS
     return action.deadline_ms
@@ -237,8 +240,7 @@ def next_step(action: Action, now_ms: int) -> NextStep:
     if action.status is Status.QUEUED:
         return NextStep.EXPIRE if now_ms >= action.queued_until_ms else NextStep.WAIT
     if action.status is Status.UNKNOWN:
-        lost = now_ms >= action.times[Status.UNKNOWN.value] + JOURNAL_MS
-        return NextStep.LOSE if lost else NextStep.ASK
+        return NextStep.LOSE if now_ms >= action.issued_ms + JOURNAL_MS else NextStep.ASK
     return _step_in_slot(action, now_ms)
 
 

@@ -29,11 +29,13 @@ from device_agent.protocol import (
     MoveJoints,
     Request,
     State,
+    Stored,
     codec,
     topics,
 )
+from device_agent.protocol.acks import message_id
 from device_agent.protocol.security import grants, signing
-from tests.harness.network.brokers import HOST, Client, RunningBroker, wait_until
+from tests.harness.network.brokers import HOST, Client, Message, RunningBroker, wait_until
 from tests.harness.paths import ROOT
 
 SPACE, AGENT, DEVICE = "lab", "arm1", "arm"
@@ -95,9 +97,10 @@ class AgentProcess:
             "password": login.password,
             "subscribe": grants.agent_command_topics(SPACE, AGENT),
             "lifetime_s": 300,
+            "confirmations": grants.agent_confirmations(SPACE, AGENT),
         }
         (self.store.folder / _ACCESS).write_text(json.dumps(access))
-        self.client: Client = broker.service()
+        self.client: Client = broker.service(on_message=self._confirm)
         self.client.subscribe(*(self.topic(kind) for kind in _KINDS))
         self.client.subscribe(self.topic(topics.TELE, "+"), self.topic(topics.LATE, "+"))
 
@@ -160,6 +163,12 @@ class AgentProcess:
 
     # ------------------------------------------------------------ messages
 
+    def _confirm(self, message: Message) -> None:
+        """Confirm a received message as the functions do."""
+        if topics.parse(message.topic).kind in topics.CONFIRMED:
+            stored = Stored(ids=(message_id(message.topic, message.payload),))
+            self.client.publish(self.topic(topics.STORED), codec.encode(stored), qos=0)
+
     def _receive_pending(self) -> list[tuple[str, bytes]]:
         self.messages += [(message.topic, message.payload) for message in self.client.pending()]
         return self.messages
@@ -199,7 +208,9 @@ class AgentProcess:
         return newest
 
     def events(self, kind: str) -> list[Event]:
-        return [event for event in self.received(topics.EVENT, Event) if event.kind == kind]
+        """All events of a kind; repeated ones once."""
+        events = {event.id: event for event in self.received(topics.EVENT, Event)}
+        return [event for event in events.values() if event.kind == kind]
 
     def ready(self) -> None:
         """Wait for telemetry over the current connection."""

@@ -14,7 +14,6 @@ from tests.harness.network.brokers import start_broker, wait_until
 TOML = """
 [buffer]
 measurements_hz = 5
-settle_s = 0.5
 
 [[devices]]
 name = "arm"
@@ -76,7 +75,7 @@ def test_messages_are_sent_later_after_broker_and_agent_were_killed(tmp_path: Pa
 
 def require_complete_measurements(agent: AgentProcess, killed_ms: int, back_ms: int) -> None:
     late = agent.received(topics.LATE, JointTelemetry, topics.JOINTS)
-    times_ms = [each.at_ms for each in late]
+    times_ms = list(dict.fromkeys(each.at_ms for each in late))  # repeated ones once
     assert times_ms == sorted(times_ms)
     numbers = sorted({each.sequence for each in (*late, *agent.telemetry()) if each.at_ms < killed_ms})
     assert max(after - before for before, after in pairwise(numbers)) < MAX_GAP, "while only the broker was down"

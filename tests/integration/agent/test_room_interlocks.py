@@ -11,9 +11,6 @@ from tests.harness.network.brokers import start_broker, wait_until
 STALE_S = 2.5
 SLOW = 0.2
 TOML = f"""
-[buffer]
-settle_s = 0.5
-
 [[devices]]
 name = "arm"
 type = "ur5"

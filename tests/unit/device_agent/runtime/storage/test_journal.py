@@ -113,7 +113,7 @@ def test_old_terminal_commands_are_deleted(open_journal: OpenJournal) -> None:
     before.begin("arm", ack("old"))
     before.record(ack("old", AckStatus.DONE, 2))
     before.begin("arm", ack("open"))
-    after = open_journal(now_ms=8 * 24 * 3600 * 1000)
+    after = open_journal(now_ms=9 * 24 * 3600 * 1000)
     assert after.begin("arm", ack("old")) is None
     assert after.begin("arm", ack("open")) is not None
 
