@@ -3,7 +3,9 @@
 A test class inherits ``AgentSuite`` and sets ``spoken``, as for ``TransportSuite``.
 """
 
+import contextlib
 import itertools
+import sqlite3
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -28,6 +30,8 @@ FAR = {"shoulder_pan": 6.0}
 _RESOLUTION_RAD = 1e-9
 """Smaller steps are rounding errors."""
 HELD_WITHIN_MS = 350
+_STORE_DOWN_S = 3.0
+"""Time for which nothing can be stored after the end of an action [s]."""
 
 
 class PairedAgent:
@@ -214,6 +218,20 @@ class AgentSuite:
         assert item["transport"] == spoken.configuration.get("transport", "mqtt") + plain
         assert item["count"] >= 1
         assert item["min_ms"] > 0
+
+    def test_an_action_that_ends_while_nothing_can_be_stored_has_the_same_end(
+        self, processes: CloudProcesses, agent: PairedAgent
+    ) -> None:
+        action = agent.move(FAR, speed=0.8, epoch=agent.take(), wait_for="started")["id"]
+        with contextlib.closing(sqlite3.connect(processes.home / "tables.sqlite", isolation_level=None)) as store:
+            store.execute("BEGIN IMMEDIATE")
+            wait_until(lambda: agent.journalled(action).status.terminal, "the end at the device")
+            ended = agent.journalled(action)
+            time.sleep(_STORE_DOWN_S)
+            store.execute("ROLLBACK")
+        shown = agent.end_of(action)
+        reason = ended.reason and {"code": ended.reason.code, "message": ended.reason.message}
+        assert (shown["status"], shown["reason"]) == (ended.status.value, reason)
 
     def test_a_lost_link_ends_motion_and_nothing_resumes(
         self, processes: CloudProcesses, agent: PairedAgent, spoken: Spoken
