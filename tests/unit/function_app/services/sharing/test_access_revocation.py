@@ -70,17 +70,39 @@ class TestQueuedActions:
         assert anna.action(behind, wait_ms=20_000, wait_for="started")["status"] == "started"
         assert [command.id for command in robot.received(MoveJoints)] == [running, behind]
 
-    def test_a_command_of_a_revoked_key_is_not_resent(self, cloud: Cloud, anna: Person, robot: Robot) -> None:
+    def test_a_command_of_a_revoked_key_is_not_resent_while_the_device_would_start_it(
+        self, cloud: Cloud, anna: Person, robot: Robot
+    ) -> None:
         _, program = make(anna)
         robot.silent = True
+        action = program.start(robot.device, ttl_ms=5_000).json()["id"]
+        tables: Any = cloud.functions.tables
+        tables.drop("ApiKeys")
+        for _ in range(4):
+            cloud.clock.advance(1.1)
+            cloud.sweep()
+        assert anna.action(action)["status"] == "published", "the device may have executed it"
+        assert len(robot.payloads[action]) == 1
+        robot.forget(action)
+        robot.silent = False
+        cloud.clock.advance(2)
+        cloud.sweep()
+        assert anna.action(action)["status"] == "expired"
+
+    def test_an_unpublished_command_of_a_revoked_key_ends(
+        self, cloud: Cloud, anna: Person, robot: Robot, broker: MemoryBroker
+    ) -> None:
+        _, program = make(anna)
+        broker.reachable = False
         action = program.start(robot.device).json()["id"]
+        broker.reachable = True
         tables: Any = cloud.functions.tables
         tables.drop("ApiKeys")
         cloud.clock.advance(2)
         cloud.sweep()
         ended = anna.action(action)
         assert (ended["status"], ended["reason"]["code"]) == ("failed", "api-key-ended")
-        assert len(robot.payloads[action]) == 1
+        assert action not in robot.payloads
 
 
 class TestGrants:

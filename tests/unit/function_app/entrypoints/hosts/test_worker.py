@@ -1,0 +1,36 @@
+"""The worker's timer decides no outcome before agents have repeated what the worker missed."""
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any
+
+from function_app.entrypoints.hosts import worker
+from function_app.entrypoints.hosts.worker import CATCH_UP_S, SWEEP_EVERY_S
+from tests.fakes.clock import MemoryClock
+from tests.fakes.event_loop import VirtualTimeLoop
+
+
+def test_after_a_start_or_a_suspension_the_timer_waits_for_agents() -> None:
+    loop = VirtualTimeLoop(MemoryClock())
+    runs: list[tuple[float, bool]] = []
+
+    async def run_due_jobs(*, current: bool) -> None:
+        runs.append((loop.time(), current))
+
+    functions: Any = SimpleNamespace(scheduler=SimpleNamespace(run_due_jobs=run_due_jobs))
+
+    async def scenario() -> float:
+        sweep = asyncio.create_task(worker._sweep(functions))
+        await asyncio.sleep(20)
+        loop._skip(100.0)  # the process is suspended
+        resumed_s = loop.time()
+        await asyncio.sleep(20)
+        sweep.cancel()
+        return resumed_s
+
+    resumed_s = loop.complete(scenario())
+    loop.end()
+    behind = [at_s for at_s, current in runs if not current]
+    assert behind == [at_s for at_s, _ in runs if at_s < CATCH_UP_S or resumed_s <= at_s < behind[-1] + SWEEP_EVERY_S]
+    assert CATCH_UP_S - SWEEP_EVERY_S <= behind[-1] - resumed_s <= CATCH_UP_S + SWEEP_EVERY_S
+    assert [current for _, current in runs][-1]
