@@ -1,6 +1,7 @@
 """Messages that wait until the cloud confirms their storage."""
 
 import logging
+import threading
 from collections.abc import Callable
 
 from device_agent.protocol import Stored, codec, topics
@@ -21,15 +22,18 @@ class Confirmations:
 
     def __init__(self) -> None:
         self.filter = ""
+        self._lock = threading.Lock()
         self._waiting: dict[str, Callable[[], None]] = {}
 
     def expect(self, topic: str, payload: bytes, delivered: Callable[[], None]) -> bool:
         """Call ``delivered`` at the confirmation of a message; returns False if the cloud does not confirm it."""
         if not self.filter or topics.parse(topic).kind not in topics.CONFIRMED:
             return False
-        while len(self._waiting) >= MAX_UNCONFIRMED:
-            self._waiting.pop(next(iter(self._waiting)), None)
-        self._waiting[message_id(topic, payload)] = delivered
+        number = message_id(topic, payload)
+        with self._lock:
+            while len(self._waiting) >= MAX_UNCONFIRMED:
+                del self._waiting[next(iter(self._waiting))]
+            self._waiting[number] = delivered
         return True
 
     def receive(self, topic: str, payload: bytes) -> bool:
@@ -41,7 +45,8 @@ class Confirmations:
         except ProtocolError as error:
             _log.warning("an invalid confirmation on %s: %s", topic, str(error)[:300])
             return True
-        for number in stored.ids:
-            if (delivered := self._waiting.pop(number, None)) is not None:
-                delivered()
+        with self._lock:
+            confirmed = [self._waiting.pop(number) for number in stored.ids if number in self._waiting]
+        for delivered in confirmed:
+            delivered()
         return True
