@@ -21,6 +21,7 @@ class MinimalDriver:
         self._frames = len(robot_type.frames)
         self._position_rad = tuple(robot_type.home_rad[joint.name] for joint in robot_type.joints)
         self._connected = False
+        self._halted = False
 
     @property
     def simulated(self) -> bool:
@@ -28,6 +29,7 @@ class MinimalDriver:
 
     def connect(self) -> None:
         self._connected = True
+        self._halted = False
 
     def twin(self) -> None:
         return None
@@ -40,6 +42,8 @@ class MinimalDriver:
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
         """Apply the positions within the joint ranges and return what was applied [rad]."""
         self._require_connection()
+        if self._halted:
+            raise DriverError("the device was halted; reconnect")
         if len(position_rad) != len(self._joints) or not all(map(math.isfinite, position_rad)):
             raise DriverError(f"expected {len(self._joints)} finite positions")
         self._position_rad = tuple(
@@ -47,6 +51,9 @@ class MinimalDriver:
             for value, joint in zip(position_rad, self._joints, strict=True)
         )
         return self._position_rad
+
+    def halt(self) -> None:
+        self._halted = True
 
     def close(self) -> None:
         self._connected = False

@@ -37,6 +37,9 @@ class LightArm:
         self._position_rad = tuple(position_rad)
         return self._position_rad
 
+    def halt(self) -> None:
+        """Implements the port; the arm does not move by itself."""
+
     def close(self) -> None:
         """Implements the port."""
 

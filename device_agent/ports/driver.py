@@ -47,6 +47,9 @@ class Driver(Protocol):
     One thread, the control loop, calls ``observe`` and ``send`` once per ``period_ms`` (see also ``RunsInline``).
     Neither blocks for longer than a fraction of the period. The constructor accesses neither disk, network nor
     hardware.
+
+    The device must not depend on the agent to come to rest: without new commands it holds its joints, and a base that
+    would continue to move brakes (see ``MobileDriver``).
     """
 
     @property
@@ -80,6 +83,17 @@ class Driver(Protocol):
             DriverError: As for ``observe``.
         """
 
+    def halt(self) -> None:
+        """Stop all motion at once and hold, by the driver's own means, because the control loop has ended or hangs.
+
+        Any thread may call it at any time, repeatedly, also without ``connect``. It neither blocks nor waits for a lock
+        that another call may hold. Until the next ``connect``, ``send`` and ``drive`` raise ``DriverError``, so that a
+        delayed command does not move the device again.
+
+        Raises:
+            DriverError: The device cannot be reached.
+        """
+
     def close(self) -> None:
         """Release the device. May be called repeatedly, and without ``connect``."""
 
@@ -99,7 +113,11 @@ class RunsInline(Driver, Protocol):
 
 @runtime_checkable
 class MobileDriver(Driver, Protocol):
-    """A driver of a mobile robot; its robot type has a ``base``."""
+    """A driver of a mobile robot; its robot type has a ``base``.
+
+    A watchdog in the hardware or the driver brakes the base to rest if ``drive`` was not called for 0.3 s. It works
+    while the agent's threads hang, and should work after the agent's process has ended.
+    """
 
     def drive(self, twist: Twist) -> Twist:
         """Command the velocity of the base for the next period, limited by the agent. Called after each ``send``.

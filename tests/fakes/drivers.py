@@ -60,10 +60,12 @@ class FakeDriver:
         self.position: tuple[float, ...] = (0.0, 0.0)
         self.broken = False
         self.refuses = False
+        self.halted = False
 
     def connect(self) -> None:
         if self.broken:
             raise DriverError("no answer from the arm; is it switched on?")
+        self.halted = False
 
     def twin(self) -> Twin | None:
         return None
@@ -74,10 +76,13 @@ class FakeDriver:
         return Observation(self.position, (0.0, 0.0), (0.0, 0.0), ())
 
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
-        if self.refuses:
+        if self.refuses or self.halted:
             raise DriverError("no")
         self.position = tuple(position_rad)
         return self.position
+
+    def halt(self) -> None:
+        self.halted = True
 
     def close(self) -> None:
         pass

@@ -284,6 +284,14 @@ class BipedDriver(MujocoDriver):
         values = {"x_m": place.x_m, "y_m": place.y_m, "yaw_rad": yaw_rad, **walker.velocity._asdict()}
         return {name: round(value, 4) for name, value in values.items()}
 
+    def halt(self) -> None:
+        """See ``MujocoDriver``; also stops a walk: the feet move together, and the legs hold."""
+        self._halted = True
+        if self._walker is not None:
+            self._walker.set_twist(REST, 0.0)
+        if self._walker is None or not self._walker.busy:
+            super().halt()
+
     def close(self) -> None:
         """See ``MujocoDriver``; also stops a walk."""
         if self._walker is not None:

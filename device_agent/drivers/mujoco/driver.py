@@ -69,6 +69,7 @@ class MujocoDriver:
         self._device = device
         self._prefix = prefix
         self._connected = False
+        self._halted = False
         self._base = 0
         self._qpos: Ints = np.zeros(0, dtype=np.intp)
         self._dof: Ints = np.zeros(0, dtype=np.intp)
@@ -109,6 +110,7 @@ class MujocoDriver:
             DriverError: The model cannot be built, or lacks a joint, actuator or frame of the manifest.
         """
         self._motors.clear()
+        self._halted = False
         if self._connected:
             self._world.recover()
             return
@@ -191,6 +193,17 @@ class MujocoDriver:
         if self._connected:
             self._world.sound(self._device, SPEECH_DB, for_s=for_s)
 
+    def halt(self) -> None:
+        """Hold the joints where their motors are commanded now.
+
+        Raises:
+            DriverError: Never; the world keeps the command until it runs again.
+        """
+        self._halted = True
+        if self._connected:
+            now = self._world.snapshot().ctrl[self._actuators]
+            self._world.command(self._device, self._actuators, now, ramp_s=0.0)
+
     def close(self) -> None:
         """Leave the world; it stops with its last user."""
         if self._connected:
@@ -233,6 +246,7 @@ class MujocoDriver:
         Raises:
             DriverError: Wrong number of values, or a value is not finite.
         """
+        self._check_halted()
         if len(position_rad) != len(self._actuators):
             raise DriverError(f"{len(position_rad)} positions for {len(self._actuators)} joints")
         if not all(map(math.isfinite, position_rad)):
@@ -243,9 +257,14 @@ class MujocoDriver:
     def _driven(self, twist: Twist) -> Snapshot:
         """The newest snapshot, for a twist of finite values."""
         snapshot = self._live()
+        self._check_halted()
         if not all(map(math.isfinite, twist)):
             raise DriverError("a commanded twist is not finite")
         return snapshot
+
+    def _check_halted(self) -> None:
+        if self._halted:
+            raise DriverError("the device was halted because its control loop did not respond; it reconnects")
 
     def _require(self) -> None:
         if not self._connected:

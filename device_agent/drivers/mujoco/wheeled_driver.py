@@ -151,6 +151,12 @@ class WheeledDriver(MujocoDriver):
         self._world.command(f"{self._device}/wheels", self._wheel_actuators, speeds, ramp_s=self._ramp_s)
         return applied
 
+    def halt(self) -> None:
+        """See ``MujocoDriver``; also brakes the wheels."""
+        super().halt()
+        if self._brake is not None:
+            self._brake.driven_s = -math.inf
+
     def report(self, stream: str) -> Mapping[str, float | bool]:
         """``odometry``, ``sonar`` and the streams of ``MujocoDriver``.
 

@@ -6,11 +6,13 @@ from collections.abc import Callable
 
 import pytest
 
-from device_agent.ports.driver import Driver, DriverError, Observation
+from device_agent.ports.driver import Driver, DriverError, MobileDriver, Observation, Twist
 from device_agent.protocol import codec
 from device_agent.protocol.manifests.robot_type import RobotType
 
 DEADLINE_S = 60.0
+FAST, REST = 0.5, 0.1
+"""Speed of a base that drives, and that rests, as a share of the commanded speed."""
 
 
 def until(condition: Callable[[], bool]) -> None:
@@ -35,6 +37,10 @@ class DriverContract:
     def connected(self, driver: Driver) -> Driver:
         driver.connect()
         return driver
+
+    def base_m_s(self, driver: Driver) -> float:
+        """Measured forward speed of a mobile robot [m/s]."""
+        raise NotImplementedError
 
     @staticmethod
     def near(observation: Observation, target: tuple[float, ...]) -> bool:
@@ -104,6 +110,52 @@ class DriverContract:
         connected.close()
         connected.connect()
         assert self.near(connected.observe(), target)
+
+    def test_a_halted_device_holds_and_accepts_commands_only_after_a_reconnect(
+        self, connected: Driver, robot_type: RobotType
+    ) -> None:
+        target = self.nudged(robot_type, connected.observe().position_rad)
+        connected.halt()
+        connected.halt()
+        before = connected.observe().position_rad
+        with pytest.raises(DriverError):
+            connected.send(target)
+        time.sleep(0.05)
+        assert connected.observe().position_rad == pytest.approx(before, abs=1e-2)
+        connected.connect()
+        connected.send(target)
+        until(lambda: self.near(connected.observe(), target))
+
+    def test_it_may_be_halted_at_any_time(self, driver: Driver) -> None:
+        driver.halt()
+        driver.connect()
+        driver.send(driver.observe().position_rad)
+        driver.close()
+        driver.halt()
+
+    @pytest.mark.parametrize("halted", [False, True])
+    def test_a_base_stops_without_commands_and_when_it_is_halted(
+        self, connected: Driver, robot_type: RobotType, *, halted: bool
+    ) -> None:
+        if robot_type.base is None:
+            return
+        assert isinstance(connected, MobileDriver)
+        twist = Twist(forward_m_s=0.5 * robot_type.base.max_linear_m_s)
+
+        def drives() -> bool:
+            connected.send(home)
+            connected.drive(twist)
+            return self.base_m_s(connected) > FAST * twist.forward_m_s
+
+        home = connected.observe().position_rad
+        until(drives)
+        if halted:
+            connected.halt()
+            with pytest.raises(DriverError):
+                connected.drive(twist)
+        until(lambda: abs(self.base_m_s(connected)) < REST * twist.forward_m_s)
+        connected.connect()
+        until(drives)
 
     def test_twin_is_a_tree_that_fits_a_retained_message(self, connected: Driver, robot_type: RobotType) -> None:
         twin = connected.twin()

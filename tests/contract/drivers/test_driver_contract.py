@@ -7,7 +7,7 @@ import pytest
 
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import MujocoDriver, Placement, World
-from device_agent.ports.driver import Driver
+from device_agent.ports.driver import Driver, ReportsStreams
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
 from tests.contract.drivers.suite import DriverContract
@@ -28,6 +28,11 @@ class TestMujocoAlone(DriverContract):
         driver = load("mujoco")(robot_type, ROBOTS / robot_type.type, {}, "arm")
         yield driver
         driver.close()
+
+    def base_m_s(self, driver: Driver) -> float:
+        assert isinstance(driver, ReportsStreams)
+        driver.observe()
+        return float(driver.report("odometry").get("forward_m_s", 0.0))
 
 
 class TestMujocoShared(DriverContract):
