@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -31,6 +32,7 @@ from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.runtime.storage.journal import Journal
 from device_agent.runtime.storage.outbox_store import OutboxStore
+from device_agent.runtime.supervision import Supervisor
 from device_agent.runtime.telemetry.latency_probe import LatencyProbe
 from device_agent.runtime.telemetry.outbox import Outbox, Publish
 from device_agent.sandbox.host import SandboxHost
@@ -42,14 +44,15 @@ from device_agent.transports.http.uploads import HttpUploads
 from device_agent.transports.pairing_monitor import PairingMonitor
 
 
+@dataclass(eq=False, slots=True)
 class RunningAgent:
-    """An agent and the resources to close with it."""
+    """An agent and the resources to close with it. While it runs, the caller must check its ``supervisor``."""
 
-    def __init__(self, agent: Agent, journal: Journal, monitor: PairingMonitor, sandbox: Sandbox) -> None:
-        self._agent = agent
-        self._sandbox = sandbox
-        self._journal = journal
-        self._monitor = monitor
+    _agent: Agent
+    _journal: Journal
+    _monitor: PairingMonitor
+    _sandbox: Sandbox
+    supervisor: Supervisor
 
     @property
     def outdated(self) -> bool:
@@ -65,9 +68,11 @@ class RunningAgent:
         """
         self._sandbox.start()
         self._agent.start()
+        self.supervisor.start()
 
     def stop(self) -> None:
         """Hold, disconnect and close. May be called repeatedly."""
+        self.supervisor.stop()
         self._agent.stop()
         self._sandbox.close()
         self._journal.close()
@@ -266,7 +271,7 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
     outbox = _outbox(store, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
     sandbox = SandboxHost(allow_unconfined=configuration.allow_unconfined_scripts)
     uploads = HttpUploads(pairing.agent, lambda: cloud_client(store, configuration, clock))
-    load = LoadGovernor()
+    load, supervisor = LoadGovernor(), Supervisor()
     devices: dict[str, Device] = {}
     neighbours: dict[str, RoomDriver] = {}
     for entry in configuration.devices:
@@ -289,10 +294,11 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
             faults=store.faults,
             uploads=uploads,
             load=load,
+            supervisor=supervisor,
             streaming=configuration.transport != "http",
         )
     agent = Agent(devices, transport, outbox=outbox, readings=readings, address=(pairing.space, pairing.agent))
-    return RunningAgent(agent, journal, monitor, sandbox)
+    return RunningAgent(agent, journal, monitor, sandbox, supervisor)
 
 
 def _transport_name(configuration: AgentConfig) -> str:
@@ -351,6 +357,7 @@ def _device(
     faults: Path,
     uploads: Uploads,
     load: LoadGovernor,
+    supervisor: Supervisor,
     streaming: bool,
 ) -> Device:
     kind = type_of(entry)
@@ -375,6 +382,7 @@ def _device(
         speech=Espeak(),
         uploads=uploads,
         load=load,
+        supervisor=supervisor,
         streaming=streaming,
     )
 

@@ -2,6 +2,7 @@
 
 import argparse
 import gc
+import os
 import signal
 import sys
 import threading
@@ -15,8 +16,15 @@ from device_agent.cli.enroll import announce, await_claim
 from device_agent.config.agent_config import AgentConfig
 from device_agent.config.identity_store import IdentityStore
 from device_agent.ports.clock import CloudClock
+from device_agent.runtime.supervision import CHECK_PERIOD_S
 
-_PAIRING_CHECK_S = 0.5
+EXIT_FAILED = 70
+"""Exit code after an essential thread has ended or hung, so that the service manager restarts the agent."""
+_STOP_S = 10.0
+"""Time for an orderly end after such a failure [s]."""
+_WATCHDOG_S, _STARTING_WATCHDOG_S = 10.0, 60.0
+"""Timeout of systemd's watchdog while the agent runs, and otherwise [s]; the latter is that of the unit."""
+_NOTIFY_S = 0.5
 _RETRY_S = 5.0
 _SWITCH_INTERVAL_S = 0.001
 
@@ -40,10 +48,10 @@ def _run(options: argparse.Namespace) -> int:
         if options.trace is not None:
             options.trace.mkdir(parents=True, exist_ok=True)
         robot_types.update(store)
-        while _run_until_unpaired(store, options.trace):
+        while (code := _run_until_unpaired(store, options.trace)) is None:
             _pair(store, qr=not options.no_qr)
             robot_types.update(store)
-    return 0
+    return code
 
 
 def _pair(store: IdentityStore, *, qr: bool) -> None:
@@ -73,8 +81,8 @@ def _exit(*_: object) -> None:
     raise SystemExit(0)
 
 
-def _run_until_unpaired(store: IdentityStore, trace: Path | None) -> bool:
-    """Run with the saved pairing until a signal arrives. Returns True if the pairing is no longer valid."""
+def _run_until_unpaired(store: IdentityStore, trace: Path | None) -> int | None:
+    """Run with the saved pairing. Returns the exit code, or ``None`` if the pairing is no longer valid."""
     stop = threading.Event()
     previous = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     agent = bootstrap.build(store, trace=trace)
@@ -85,15 +93,36 @@ def _run_until_unpaired(store: IdentityStore, trace: Path | None) -> bool:
         _prioritize_control_loops()
         print("running", flush=True)
         systemd.ready("running")
-        while not stop.wait(_PAIRING_CHECK_S):
-            systemd.notify_watchdog()
-            if agent.outdated:
-                return True
+        systemd.set_watchdog(_WATCHDOG_S)
+        return _supervise(agent, stop)
     finally:
+        systemd.set_watchdog(_STARTING_WATCHDOG_S)
         agent.stop()
         for number, handler in previous.items():
             signal.signal(number, handler)
-    return False
+
+
+def _supervise(agent: bootstrap.RunningAgent, stop: threading.Event) -> int | None:
+    """Check the agent's threads until it ends; see ``_run_until_unpaired``."""
+    notified_s = 0.0
+    while not stop.wait(CHECK_PERIOD_S):
+        if reason := agent.supervisor.check():
+            print(f"telescope agent: {reason}", file=sys.stderr, flush=True)
+            _force_exit_later()
+            return EXIT_FAILED
+        if agent.supervisor.healthy and time.monotonic() - notified_s >= _NOTIFY_S:
+            notified_s = time.monotonic()
+            systemd.notify_watchdog()
+        if agent.outdated:
+            return None
+    return 0
+
+
+def _force_exit_later() -> None:
+    """End the process even if the failed thread blocks its orderly end."""
+    timer = threading.Timer(_STOP_S, os._exit, (EXIT_FAILED,))
+    timer.daemon = True
+    timer.start()
 
 
 def _prioritize_control_loops() -> None:

@@ -10,6 +10,11 @@ def ready(status: str) -> None:
     _notify(f"READY=1\nSTATUS={status}")
 
 
+def set_watchdog(timeout_s: float) -> None:
+    """Change the time without a notification after which systemd restarts the agent [s]."""
+    _notify(f"WATCHDOG_USEC={round(timeout_s * 1e6)}")
+
+
 def notify_watchdog() -> None:
     """Trigger the watchdog; call more often than ``WatchdogSec``."""
     _notify("WATCHDOG=1")

@@ -8,6 +8,7 @@ Stop go from the transport's thread straight to the controller.
 import logging
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
@@ -17,6 +18,7 @@ from device_agent.ports.geometry import RobotGeometry
 from device_agent.ports.sandbox import Sandbox
 from device_agent.ports.skills import Skills
 from device_agent.ports.speech import Speech
+from device_agent.ports.threads import SupervisedThread
 from device_agent.ports.uploads import Uploads
 from device_agent.protocol import JointTelemetry, Measurements, Setpoint, Stop, StopLatch, codec, topics
 from device_agent.protocol.errors import ProtocolError, SignatureError
@@ -32,16 +34,17 @@ from device_agent.runtime.actions.speech_output import SpeechOutput
 from device_agent.runtime.authority.event_recorder import EventRecord, EventRecorder
 from device_agent.runtime.authority.interlocks import Interlocks
 from device_agent.runtime.authority.lease_gate import LeaseGate
-from device_agent.runtime.commands.command_processor import CommandProcessor
+from device_agent.runtime.commands.command_processor import COMMAND_PROCESSOR, CommandProcessor
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
-from device_agent.runtime.control.control_loop import ControlLoop
+from device_agent.runtime.control.control_loop import CONTROL_LOOP, ControlLoop
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.room.room_device import RoomDevice
-from device_agent.runtime.room.sensor_loop import SensorLoop
+from device_agent.runtime.room.sensor_loop import SENSOR_LOOP, SensorLoop
 from device_agent.runtime.storage.journal import Journal
+from device_agent.runtime.supervision import Failure, PartFaults, Supervisor
 from device_agent.runtime.telemetry.camera_streamer import CameraStreamer
 from device_agent.runtime.telemetry.device_publisher import DevicePublisher
 from device_agent.runtime.telemetry.outbox import Outbox, Publish
@@ -83,12 +86,16 @@ class Device:
         speech: Speech | None = None,
         uploads: Uploads | None = None,
         load: LoadGovernor | None = None,
+        supervisor: Supervisor | None = None,
         streaming: bool = True,
     ) -> None:
         self.name = name
         self._load = load or LoadGovernor()
         self._driver = driver
         self._sandbox = sandbox
+        supervisor = supervisor or Supervisor()
+        supervisor.add(self)
+        self._part_faults = PartFaults(supervisor)
         self._readings = readings
         room_device = driver if isinstance(driver, RoomDevice) else None
         if room_device is not None:
@@ -171,6 +178,7 @@ class Device:
             cloud_clock=cloud_clock,
             keys=keys,
             wake=self._wake,
+            part_faults=self._part_faults.present,
             device_faults=tuple if room_device is None else room_device.watchdog.faults,
             load=self._load,
         )
@@ -226,6 +234,32 @@ class Device:
         self._events.record(EventRecord(EventKind.AGENT_STOPPED, "the agent was shut down"))
         self._commands.stop()
         self._driver.close()
+
+    # ------------------------------------------------------------ failures of threads (supervisor's thread)
+
+    def part_failed(self, failure: Failure) -> None:
+        """Hold and report, because a thread has ended or hangs."""
+        self._part_faults.add(failure)
+        if not failure.lasts:
+            self._part_faults.remove(failure)
+        self._events.record(EventRecord(EventKind.PART_FAILED, failure.message, "error", {"part": failure.part}))
+        # In a separate thread: a driver or thread that hangs must not block the supervisor.
+        hold = partial(self._hold_after, failure)
+        SupervisedThread(hold, name=f"{self.name}-hold", part="hold after a failure", device=self.name).start()
+
+    def _hold_after(self, failure: Failure) -> None:
+        if failure.part in {CONTROL_LOOP, SENSOR_LOOP}:
+            self._loop.fail(failure.message)
+        else:
+            self._controller.hold(Refused("fault", failure.message))
+        if failure.part == COMMAND_PROCESSOR:
+            self._commands.report_failure()
+
+    def part_recovered(self, failure: Failure) -> None:
+        """Report that a failure is over. The operator must take control again."""
+        self._part_faults.remove(failure)
+        message = f"the failure of the {failure.part} is over"
+        self._events.record(EventRecord(EventKind.PART_RECOVERED, message, data={"part": failure.part}))
 
     @property
     def quiet(self) -> bool:

@@ -8,6 +8,7 @@ saves 10 to 30 % of a colour frame and about half of a depth frame (measured).
 
 import contextlib
 import copy
+import math
 import os
 import queue
 import sys
@@ -24,9 +25,11 @@ import numpy.typing as npt
 
 from device_agent.ports.sensor import Bytes, Depths, Floats, SensorError
 from device_agent.ports.simulation import SimulatedWorld
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.simulation import offscreen
 
 TIMEOUT_S = 5.0
+_RESPONSE_S = 15.0
 """A frame that is not rendered within this time is abandoned."""
 _MAX_GEOMS = 5000
 _CHANGING = ("light_diffuse", "light_ambient", "light_active", "geom_rgba", "mat_rgba")
@@ -76,7 +79,8 @@ class Renderer:
         self._life = threading.Lock()
         self._users = 0
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
-        self._thread: threading.Thread | None = None
+        self._thread: SupervisedThread | None = None
+        self._stopping = threading.Event()
 
     def open(self) -> None:
         """Register a user."""
@@ -90,6 +94,7 @@ class Renderer:
             if self._users or self._thread is None:
                 return
             thread, self._thread = self._thread, None
+            self._stopping.set()
             self._jobs.put(None)
         thread.join(timeout=TIMEOUT_S)
 
@@ -110,11 +115,8 @@ class Renderer:
             if not self._users:
                 raise SensorError("the camera is not connected")
             if self._thread is None:
-                self._jobs = queue.SimpleQueue()
-                self._thread = threading.Thread(
-                    target=_draw, args=(self._world, self._jobs), name="renderer", daemon=True
-                )
-                self._thread.start()
+                self._jobs, self._stopping = queue.SimpleQueue(), threading.Event()
+                self._thread = _start(self._world, self._jobs, self._stopping)
             self._jobs.put(_Job(camera, (width, height), depth, future))
         try:
             return future.result(timeout=TIMEOUT_S)
@@ -123,12 +125,30 @@ class Renderer:
             raise SensorError(f"no image within {TIMEOUT_S:.0f} s; the machine is overloaded") from error
 
 
-def _draw(world: SimulatedWorld, jobs: "queue.SimpleQueue[_Job | None]") -> None:
+def _start(
+    world: SimulatedWorld, jobs: "queue.SimpleQueue[_Job | None]", stopping: threading.Event
+) -> SupervisedThread:
+    thread = SupervisedThread(
+        lambda: _draw(world, jobs, thread),
+        name="renderer",
+        part="renderer",
+        stopping=stopping,
+        recovery=Recovery.RESTART,
+    )
+    thread.start()
+    return thread
+
+
+def _draw(world: SimulatedWorld, jobs: "queue.SimpleQueue[_Job | None]", thread: SupervisedThread) -> None:
     """Process jobs one by one; runs in the renderer's thread."""
     if sys.platform == "linux":  # only Linux has thread priorities; the GL threads inherit this one
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
     view: _View | None = None
-    while (job := jobs.get()) is not None:
+    while True:
+        thread.beat(math.inf)
+        if (job := jobs.get()) is None:
+            break
+        thread.beat(_RESPONSE_S)
         if not job.future.set_running_or_notify_cancel():
             continue
         try:

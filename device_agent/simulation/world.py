@@ -17,6 +17,7 @@ import numpy as np
 
 from device_agent.ports.driver import DriverError
 from device_agent.ports.simulation import Process
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.simulation.actuator_ramps import ActuatorRamps, control_rows
 from device_agent.simulation.mjcf.equality_joints import SCALAR_JOINTS
 from device_agent.simulation.scene_assembly import TIMESTEP_S, Placement, assemble, home_state
@@ -79,7 +80,7 @@ class World:
         self._sounds: dict[str, tuple[float, float]] = {}
         self._users = 0
         self._life = threading.Lock()  # guards starting and stopping only
-        self._thread: threading.Thread | None = None
+        self._thread: SupervisedThread | None = None
         self._stopping = threading.Event()
         self._model: Any = None
         self._data: Any = None
@@ -304,7 +305,14 @@ class World:
         self._traces = tuple(traces)
         self._stopping.clear()
         self._publish()
-        self._thread = threading.Thread(target=self._run, name="mujoco-world", daemon=True)
+        self._thread = SupervisedThread(
+            self._run,
+            name="mujoco-world",
+            part="simulation",
+            stopping=self._stopping,
+            recovery=Recovery.EXIT,
+            within_s=STALE_S,
+        )
         self._thread.start()
 
     def _stop_thread(self) -> None:
@@ -347,11 +355,12 @@ class World:
     def _run(self) -> None:
         try:
             self._run_in_real_time()
-        except Exception as error:  # drivers read the fault of a failed thread
+        except BaseException as error:  # drivers read the fault of a failed thread, and restart the world
             log.exception("the simulation stopped")
             self._fault = f"the simulation stopped: {error}"
             self._publish()
         finally:
+            self._stopping.set()
             for trace in self._traces:
                 trace.close()
 
@@ -360,6 +369,8 @@ class World:
         count = GROUP_STEPS
         warned = -WARN_EVERY_S
         while not self._stopping.is_set():
+            if self._thread is not None:
+                self._thread.beat()
             self._advance(count)
             self._publish()
             if self._fault:

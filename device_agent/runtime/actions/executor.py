@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from device_agent.ports.sandbox import Sandbox
+from device_agent.ports.threads import SupervisedThread
 from device_agent.protocol import AckStatus, ActionState, Command, Reason, RoomTask, RunMovement, Task
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
@@ -21,6 +22,7 @@ Report = Callable[..., None]
 ActionRequest = RunMovement | Task
 
 _PROGRESS_PERIOD_S = 0.2
+_INTERNAL = Refused("internal", "the agent failed during the action; see the agent's log")
 _log = logging.getLogger(__name__)
 
 
@@ -63,7 +65,8 @@ class ActionExecutor:
             else:
                 run.reserve(room_actions.OneShotAction(partial(run.robot.execute_task, request)))
             self._run = run
-        threading.Thread(target=self._execute, args=(run,), name=f"action-{command.id}", daemon=True).start()
+        name, device = f"action-{command.id}", command.device
+        SupervisedThread(partial(self._execute, run), name=name, part="action", device=device).start()
         run.report_started()
 
     def cancel(self, action: str, caller: str) -> None:
@@ -103,6 +106,9 @@ class ActionExecutor:
     def _execute(self, run: "_Run") -> None:
         try:
             run.execute()
+        except BaseException:
+            run.end(AckStatus.FAILED, _INTERNAL)
+            raise
         finally:
             run.robot.release()
             with self._lock:
@@ -194,7 +200,7 @@ class _Run:
             self.end(AckStatus.FAILED, Refused("script_failed", str(failed)))
         except Exception:  # noqa: BLE001 (any error ends the action as failed)
             _log.exception("action %s", self.command.id)
-            self.end(AckStatus.FAILED, Refused("internal", "the agent failed during the action; see the agent's log"))
+            self.end(AckStatus.FAILED, _INTERNAL)
 
     def end(self, status: AckStatus, why: Refused) -> None:
         """End the action, from any thread; the first reason applies."""

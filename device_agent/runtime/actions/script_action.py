@@ -7,12 +7,14 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import msgspec
 
 from device_agent.ports import script_calls
 from device_agent.ports.sandbox import Limits, Sandbox, SandboxError, SandboxProcess
+from device_agent.ports.threads import SupervisedThread
 from device_agent.protocol import RunMovement
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.errors import Refused
@@ -106,7 +108,7 @@ class ScriptAction:
         except SandboxError as error:
             raise ScriptFailed(str(error)) from error
         self._process = process
-        watcher = threading.Thread(target=self._watch, args=(process,), name="script-watch", daemon=True)
+        watcher = SupervisedThread(partial(self._watch, process), name="script-watch", part="watch of a script")
         with contextlib.closing(process):
             if self._killed.is_set():
                 process.kill()

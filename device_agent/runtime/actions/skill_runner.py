@@ -3,9 +3,11 @@
 import contextlib
 import threading
 import time
+from functools import partial
 from typing import Protocol
 
 from device_agent.ports.skills import Skill, SkillError
+from device_agent.ports.threads import SupervisedThread
 from device_agent.protocol import Express, RunBehaviour, Say, SetStiffness, TakePosture
 from device_agent.protocol.manifests import task_kinds
 from device_agent.runtime.actions.device_context import DeviceContext
@@ -117,8 +119,8 @@ class SkillRunner:
         """Start to speak while the robot moves."""
         self._context.speech.start(utterance)
         if self._context.performs(task_kinds.SPEECH):
-            args = (utterance.text,)
-            threading.Thread(target=self._speak_by_driver, args=args, name="speech", daemon=True).start()
+            speak = partial(self._speak_by_driver, utterance.text)
+            SupervisedThread(speak, name="speech", part="speech", device=self._context.name).start()
 
     def _speak_by_driver(self, text: str) -> None:
         with contextlib.suppress(Refused):  # the behaviour has ended, or the driver cannot speak now

@@ -5,9 +5,11 @@ import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.speech import Speech, SpeechError, Spoken
+from device_agent.ports.threads import SupervisedThread
 from device_agent.ports.uploads import UploadError, Uploads
 from device_agent.protocol import LANGUAGE_PATTERN
 from device_agent.protocol.events import EventKind
@@ -66,7 +68,8 @@ class SpeechOutput:
         if spoken is None:
             return Utterance(text, language, estimate_duration_s(text))
         utterance = Utterance(text, language, min(spoken.duration_s, _MAX_DURATION_S), has_audio=True)
-        threading.Thread(target=self._upload, args=(utterance, spoken), name="speech", daemon=True).start()
+        upload = partial(self._upload, utterance, spoken)
+        SupervisedThread(upload, name="speech", part="upload of speech", device=self._device).start()
         return utterance
 
     def start(self, utterance: Utterance) -> None:

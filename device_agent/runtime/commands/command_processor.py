@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 
 from device_agent.ports.clock import CloudClock, wall_ms
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.protocol import (
     AckStatus,
     CancelAction,
@@ -53,6 +54,9 @@ FAULT_STABLE_S = 30.0
 """A fault is cleared when its condition has been absent for this long [s]."""
 _DRIVER = "driver"
 """Code of the driver's error."""
+COMMAND_PROCESSOR = "command processor"
+_RESPONSE_S = 3.0
+"""A processor without progress for this time hangs [s]; a slow disk may delay a write for more than a second."""
 _IDLE_S, _CONFIRM_S = 0.1, 0.01
 """Time between two checks of state and events, and of a Stop that the control loop has not applied yet [s]."""
 _log = logging.getLogger(__name__)
@@ -75,6 +79,7 @@ class CommandProcessor:
         wake: Callable[[], None],
         load: LoadGovernor,
         device_faults: Callable[[], tuple[Fault, ...]] = tuple,
+        part_faults: Callable[[], tuple[Fault, ...]] = tuple,
     ) -> None:
         self._address = address
         self._name = address[2]
@@ -88,14 +93,24 @@ class CommandProcessor:
         self._wake = wake
         self._load = load
         self._device_faults = device_faults
+        self._part_faults = part_faults
         self._control_request = PendingControlRequest()
         self._fault_reporter = FaultReporter(stable_s=FAULT_STABLE_S)
         self._pending_stops: dict[str, int] = {}
         self._twin: Twin | None = None
+        self._fault_raised = False
         self._commands: queue.Queue[bytes] = queue.Queue(maxsize=_MAX_WAITING)
         self._connected = threading.Event()
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"{self._name}-commands", daemon=True)
+        self._thread = SupervisedThread(
+            self._run,
+            name=f"{self._name}-commands",
+            part=COMMAND_PROCESSOR,
+            device=self._name,
+            stopping=self._stopping,
+            recovery=Recovery.EXIT,
+            within_s=_RESPONSE_S,
+        )
 
     def start(self, twin: Twin | None) -> None:
         """Start to process commands. The drawing of the device is published after each connection."""
@@ -105,8 +120,13 @@ class CommandProcessor:
     def stop(self) -> None:
         """Journal and publish the rest, and end. May be called twice."""
         self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=2)
+        self._thread.join(timeout=2)
+
+    def report_failure(self) -> None:
+        """Publish state and events from another thread, because the processor's has ended or hangs."""
+        if not self._thread.is_alive():
+            self._guarded(self._publish_state)
+        self._guarded(partial(self._publish_events, last=True))
 
     def submit(self, payload: bytes) -> None:
         """Add a received command to the queue; never blocks.
@@ -125,6 +145,7 @@ class CommandProcessor:
 
     def _run(self) -> None:
         while not self._stopping.is_set():
+            self._thread.beat()
             with contextlib.suppress(queue.Empty):
                 payload = self._commands.get(timeout=_CONFIRM_S if self._pending_stops else _IDLE_S)
                 self._guarded(partial(self._process, payload))
@@ -154,7 +175,8 @@ class CommandProcessor:
         if self._connected.is_set():
             self._connected.clear()
             self._publisher.publish_description(self._twin)
-        self._publisher.publish_state(self._snapshot())
+        snapshot = self._snapshot()
+        self._publisher.publish_state(snapshot, urgent=self._fault_raised)
 
     def _publish_events(self, *, last: bool = False) -> None:
         """Publish the recorded events; at the last call also counted rejections."""
@@ -303,12 +325,16 @@ class CommandProcessor:
                 raise
 
     def _faults(self) -> tuple[Fault, ...]:
-        """Open faults: the driver's error, or else those that the driver does not raise. One event for each change."""
-        error = self._controller.fault
-        present = self._device_faults()
-        if error is not None:
-            present = (Fault(code=_DRIVER, message=error[:2000], since_ms=wall_ms()),)
+        """Open faults: of threads; the driver's error, or else those that the driver does not raise."""
+        error, parts = self._controller.fault, self._part_faults()
+        if error is None:
+            present = parts + self._device_faults()
+        elif any(error == fault.message for fault in parts):
+            present = parts
+        else:
+            present = (*parts, Fault(code=_DRIVER, message=error[:2000], since_ms=wall_ms()))
         changes = self._fault_reporter.update(present)
+        self._fault_raised = bool(changes.raised)
         for fault in changes.raised:
             if fault.code == _DRIVER:
                 self._events.record(EventRecord(EventKind.DRIVER_FAILED, fault.message, "error"))

@@ -15,6 +15,7 @@ import numpy as np
 
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.driver import Driver, DriverError, MobileDriver, Observation, RunsInline
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.protocol import JointTelemetry, Mode
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.control.command_arbiter import ControlOutput
@@ -32,6 +33,11 @@ Each setpoint triggers a message. Consoles send setpoints 25 ms apart; a message
 _RECONNECT_PERIOD_S = 1.0
 _REST_TIMEOUT_S = 1.0
 _STOP_TIMEOUT_S = 2.0
+RESPONSE_S = 0.7
+"""A loop without a new period for this time hangs [s]; with the supervisor's period it is noticed within 1 s."""
+_CONNECT_S = 30.0
+"""Maximum time of a reconnection, during which the device holds [s]."""
+CONTROL_LOOP = "control loop"
 _MIN_ELAPSED_S = 1e-4
 """Lower bound of the time since the last period: ``ruckig`` cannot plan for a duration of 0 [s]."""
 _log = logging.getLogger(__name__)
@@ -76,7 +82,15 @@ class ControlLoop:
         self._requested = threading.Event()
         self._period_lock = threading.Lock()
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"{name}-loop", daemon=True)
+        self._thread = SupervisedThread(
+            self._run,
+            name=f"{name}-loop",
+            part=CONTROL_LOOP,
+            device=name,
+            stopping=self._stopping,
+            recovery=Recovery.EXIT,
+            within_s=self._period_s + RESPONSE_S,
+        )
         self.observation: Observation | None = None
 
     def start(self) -> None:
@@ -92,6 +106,18 @@ class ControlLoop:
         self._controller.start_at(self.observation.position_rad)
         self._thread.start()
 
+    def fail(self, message: str) -> None:
+        """Stop the device without the loop, which has ended or hangs. If it responds again, it reconnects."""
+        self._halt()
+        self._error = message
+        self._controller.set_fault(message)
+
+    def _halt(self) -> None:
+        try:
+            self._driver.halt()
+        except Exception:  # noqa: BLE001 (a defect of the driver must not end the thread that reports it)
+            _log.exception("%s: the driver cannot be halted", self._name)
+
     def stop(self) -> None:
         """Wait up to a second for rest, and end the thread. May be called twice."""
         deadline_s = time.monotonic() + _REST_TIMEOUT_S
@@ -103,14 +129,17 @@ class ControlLoop:
             timeout=_STOP_TIMEOUT_S
         ):  # a running period ends first; then the driver may be closed
             self._period_lock.release()
-        if self._thread.is_alive():
-            self._thread.join(timeout=_STOP_TIMEOUT_S)
+        self._thread.join(timeout=_STOP_TIMEOUT_S)
 
     def wake(self) -> None:
         """Start the next period now if the device is at rest, in this thread if the driver is ``RunsInline``.
 
         A pending Stop also interrupts motion if the driver is ``RunsInline``; otherwise it waits for the next period.
+        If the loop has ended or hangs, the driver is halted instead.
         """
+        if self._controller.stop_pending and not self._thread.responsive:
+            self._halt()
+            return
         # A running period may have been computed before the Stop arrived.
         timeout_s = self._period_s if self._controller.stop_pending else 0
         if self._runs_inline and self._period_lock.acquire(timeout=timeout_s):
@@ -130,6 +159,7 @@ class ControlLoop:
     def _run(self) -> None:
         self._next_s = time.monotonic()
         while not self._stopping.is_set():
+            self._thread.beat()
             early = self._wait()
             with self._period_lock:
                 if self._stopping.is_set():
@@ -189,7 +219,9 @@ class ControlLoop:
     def _handle_fault(self) -> None:
         self._controller.set_fault(self._error)
         self._controller.record_period(self._controller.update(time.monotonic()))
+        self._thread.beat(_CONNECT_S)
         while not self._stopping.wait(_RECONNECT_PERIOD_S):
+            self._thread.beat(_CONNECT_S)
             with contextlib.suppress(DriverError):
                 self._driver.connect()
                 self.observation = self._driver.observe()

@@ -125,6 +125,11 @@ class Controller:
             if self._state.goals.moving or self._state.authority.reservation is not None:
                 self._state.authority.end(why)
 
+    def hold(self, why: Refused) -> None:
+        """Brake, and end the lease and the running action."""
+        with self._lock:
+            self._state.authority.end(why)
+
     def set_fault(self, message: str) -> None:
         """Hold until ``clear_fault``: the driver failed."""
         with self._lock:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.driver import Observation
 from device_agent.ports.sensor import Camera, Reducible, SensorError
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.protocol import MAX_VALUES, Measurements, Mode
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
@@ -26,6 +27,9 @@ _CHECK_PERIOD_S = 0.05
 _RECONNECT_PERIOD_S = 1.0
 _HOLD_MODES = frozenset({Mode.STOPPED, Mode.HOLDING, Mode.FAULT})
 """Modes in which the device must not move."""
+SENSOR_LOOP = "sensor loop"
+_RESPONSE_S = 10.0
+"""A loop without progress for this time hangs [s]; a reading or reconnection may take as long as the sensor needs."""
 _NO_JOINTS = Observation((), (), (), ())
 _log = logging.getLogger(__name__)
 
@@ -67,7 +71,15 @@ class SensorLoop:
         self._held = False
         self._logged = ""
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"{name}-sensing", daemon=True)
+        self._thread = SupervisedThread(
+            self._run,
+            name=f"{name}-sensing",
+            part=SENSOR_LOOP,
+            device=name,
+            stopping=self._stopping,
+            recovery=Recovery.RESTART,
+            within_s=_RESPONSE_S,
+        )
         self.observation: Observation | None = None
 
     def start(self) -> None:
@@ -85,14 +97,20 @@ class SensorLoop:
         """End the thread. May be called twice."""
         self._stopping.set()
         self._room_device.rates_changed.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=2)
+        self._thread.join(timeout=2)
+
+    def fail(self, message: str) -> None:
+        """Hold moving parts without the loop, which has ended or hangs. If it responds again, it reconnects."""
+        self._controller.set_fault(message)
+        with contextlib.suppress(SensorError):
+            self._room_device.hold()
 
     def wake(self) -> None:
         """See ``ControlLoop.wake``: a room device has no setpoints."""
 
     def _run(self) -> None:
         while not self._stopping.is_set():
+            self._thread.beat()
             now_s = time.monotonic()
             try:
                 if self._controller.fault is not None:

@@ -187,13 +187,13 @@ class DevicePublisher:
         self._published_s = float("-inf")
         self._repeated, self._repeat_s, self._pause_s = 0, float("-inf"), FIRST_REPEAT_S
 
-    def publish_state(self, snapshot: StateSnapshot) -> None:
-        """Publish ``state`` on change, at most once a second, and every 30 s."""
+    def publish_state(self, snapshot: StateSnapshot, *, urgent: bool = False) -> None:
+        """Publish ``state`` on change, at most once a second unless it is urgent, and every 30 s."""
         now_s = time.monotonic()
         key = snapshot.key()
         age_s = now_s - self._published_s
         period_s = LOADED_STATE_PERIOD_S if snapshot.load else STATE_PERIOD_S
-        if age_s < STATE_MIN_GAP_S or (key == self._published_key and age_s < period_s):
+        if (age_s < STATE_MIN_GAP_S and not urgent) or (key == self._published_key and age_s < period_s):
             return
         at_ms = wall_ms()
         state = State(

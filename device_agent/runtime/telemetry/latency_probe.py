@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.ports.transport import LinkChanged, Receive, Transport
 from device_agent.protocol import topics
 
@@ -29,6 +30,8 @@ SPACING_S = 1.0
 """Minimum time between two samples of a device: a message in a queue would measure the queue [s]."""
 MAX_SAMPLES = 100
 """Samples of one device that wait for upload; older ones are dropped."""
+_RESPONSE_S = 60.0
+"""An upload that takes longer hangs [s]."""
 _log = logging.getLogger(__name__)
 
 
@@ -44,7 +47,14 @@ class LatencyProbe:
         self._samples: dict[str, deque[Sample]] = {}
         self._uploaded_s: dict[str, float] = {}
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="latency-probe", daemon=True)
+        self._thread = SupervisedThread(
+            self._run,
+            name="latency-probe",
+            part="upload of latencies",
+            stopping=self._stopping,
+            recovery=Recovery.RESTART,
+            within_s=_RESPONSE_S,
+        )
 
     def start(self, receive: Receive, link_changed: LinkChanged) -> None:
         """See ``Transport.start``."""
@@ -96,6 +106,7 @@ class LatencyProbe:
 
     def _run(self) -> None:
         while not self._stopping.wait(UPLOAD_PERIOD_S):
+            self._thread.beat()
             self._upload_one()
 
     def _upload_one(self) -> None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from device_agent.ports.clock import wall_ms
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.protocol import codec, topics
 from device_agent.protocol.events import EventKind
 from device_agent.runtime.authority.event_recorder import EventRecord, event_message
@@ -39,6 +40,8 @@ _MAX_INCOMING = 5000
 _SAVE_RETRY_S = 5.0
 _PERIOD_S = 0.25
 _DRAIN_S = 0.5
+_RESPONSE_S = 15.0
+"""An outbox without progress for this time hangs [s]; a slow disk may delay it for seconds."""
 _log = logging.getLogger(__name__)
 
 
@@ -94,7 +97,14 @@ class Outbox:
         self._stopping = threading.Event()
         self._up = threading.Event()
         self._connected = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
+        self._thread = SupervisedThread(
+            self._run,
+            name="outbox",
+            part="outbox",
+            stopping=self._stopping,
+            recovery=Recovery.RESTART_OR_EXIT,
+            within_s=_RESPONSE_S,
+        )
         # Numbers above 0 are rows on disk; numbers below 0 are only in memory.
         self._open = False
         self._error = ""
@@ -116,8 +126,7 @@ class Outbox:
         """Store the rest, and send the last messages if the link is up. May be called twice."""
         self._stopping.set()
         self._wake.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=3)
+        self._thread.join(timeout=3)
 
     def add_event(self, topic: str, payload: bytes, *, at_ms: int) -> None:
         """Store an event, and send it as soon as possible."""
@@ -169,6 +178,7 @@ class Outbox:
 
     def _run(self) -> None:
         while not self._stopping.is_set():
+            self._thread.beat()
             self._wake.wait(_PERIOD_S)
             self._wake.clear()
             self._iterate(time.monotonic())

@@ -8,8 +8,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from device_agent.ports.driver import DriverError
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.protocol import Stream
 
+_RESPONSE_S = 15.0
+"""A poll that takes longer hangs [s]; the renderer of a simulated camera has a timeout of 10 s."""
 _log = logging.getLogger(__name__)
 
 
@@ -43,7 +46,14 @@ class PeriodicPoller:
         self._label = f"{device}: {kind}"
         self._schedules = {source.name: _Schedule(1 / source.rate_hz) for source in sources}
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"{device}-{kind}", daemon=True)
+        self._thread = SupervisedThread(
+            self._run,
+            name=f"{device}-{kind}",
+            part=f"{kind} thread",
+            device=device,
+            stopping=self._stopping,
+            recovery=Recovery.RESTART,
+        )
 
     def start(self) -> None:
         """Start to poll, if there are sources."""
@@ -53,8 +63,7 @@ class PeriodicPoller:
     def stop(self) -> None:
         """Stop. May be called twice."""
         self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=2)
+        self._thread.join(timeout=2)
 
     def _run(self) -> None:
         wait_s = 0.0
@@ -62,11 +71,13 @@ class PeriodicPoller:
             now_s = time.monotonic()
             for name, schedule in self._schedules.items():
                 if schedule.due_s <= now_s:
+                    self._thread.beat(_RESPONSE_S)
                     period_s = schedule.period_s / self._share()
                     next_s = schedule.due_s + period_s
                     schedule.due_s = next_s if next_s > now_s else now_s + period_s
                     self._log_change(name, schedule, self._poll_once(name))
             wait_s = max(0.0, min(schedule.due_s for schedule in self._schedules.values()) - time.monotonic())
+            self._thread.beat(wait_s + _RESPONSE_S)
 
     def _poll_once(self, name: str) -> str:
         """Poll a source; returns the error message, or an empty string."""

@@ -19,6 +19,7 @@ from device_agent.perception.occupancy_grid import OccupancyGrid
 from device_agent.perception.sensor_fusion import SensorFusion, Zone
 from device_agent.perception.tracker import Box
 from device_agent.ports.sensor import Capture, Image, RoomDriver, Scan, SensorError, Values
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import room as rooms
 from device_agent.protocol.manifests.room import Room, RoomDeviceManifest
@@ -41,6 +42,7 @@ SILENT_S = 3.0
 _EDGE_M = 0.2
 """The grid extends into the walls by this distance [m]."""
 _STOP_TIMEOUT_S = 5.0
+_RESPONSE_S = 10.0
 _DIGITS = 3
 
 
@@ -133,7 +135,7 @@ class PerceptionDriver:
             known = ", ".join(Options.__struct_fields__)
             raise SensorError(f"options of '{device.name}': {error}; valid options: {known}") from error
         self._fusion: SensorFusion | None = None
-        self._thread: threading.Thread | None = None
+        self._thread: SupervisedThread | None = None
         self._stopping = threading.Event()
         self._life = threading.Lock()
         self._share = 1.0
@@ -157,11 +159,19 @@ class PerceptionDriver:
                 if name not in self._neighbours:
                     known = ", ".join(sorted(self._neighbours)) or "none"
                     raise SensorError(f"'{self._device.name}' needs device '{name}'; this agent's devices: {known}")
-            self._fusion = self._fusion or self.make()
+            fusion = self._fusion = self._fusion or self.make()
             self._sampled_s = time.monotonic()
             self._stopping.clear()
-            self._thread = threading.Thread(target=self._run, args=(self._fusion,), name="perception", daemon=True)
-            self._thread.start()
+            self._thread = thread = SupervisedThread(
+                lambda: self._run(thread, fusion),
+                name="perception",
+                part="perception",
+                device=self._device.name,
+                stopping=self._stopping,
+                recovery=Recovery.RESTART,
+                within_s=_RESPONSE_S,
+            )
+            thread.start()
 
     def read(self, stream: str) -> Values:
         """See ``RoomDriver``."""
@@ -316,9 +326,10 @@ class PerceptionDriver:
         """Present time between two samples [s]."""
         return 1.0 / (self._options.look_hz * self._share)
 
-    def _run(self, fusion: SensorFusion) -> None:
+    def _run(self, thread: SupervisedThread, fusion: SensorFusion) -> None:
         due_s = time.monotonic()
         while not self._stopping.is_set():
+            thread.beat()
             for name in self._sensors:
                 self._sample(fusion, name)
             now_s = time.monotonic()

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from device_agent.ports.clock import wall_ms
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.ports.transport import LinkChanged, Receive
 from device_agent.protocol import KINDS, PROTOCOL, Ack, Presence, codec, topics
 from device_agent.protocol.errors import ProtocolError
@@ -37,6 +38,8 @@ _REDELIVERY_S = 5.0
 _BUSY_PAUSE_S = 0.2
 _ABORT_INTERVAL_S = 0.02
 _DISCONNECT_S = 0.7
+_RESPONSE_S = 120.0
+"""A thread without progress for this time hangs [s]: a poll, its retry and a check of the pairing."""
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
@@ -86,16 +89,23 @@ class HttpTransport:
         self._up = False
         self._interrupt = threading.Event()
         self._stopping = threading.Event()
-        self._threads: list[threading.Thread] = []
+        self._threads = [
+            SupervisedThread(
+                target,
+                name=name,
+                part=part,
+                stopping=self._stopping,
+                recovery=Recovery.RESTART_OR_EXIT,
+                within_s=_RESPONSE_S,
+            )
+            for target, name, part in ((self._run, "http-poll", "HTTP poll"), (self._send, "http-send", "HTTP sender"))
+        ]
+        self._poll_thread, self._send_thread = self._threads
 
     def start(self, receive: Receive, link_changed: LinkChanged) -> None:
         """Implements ``Transport.start``."""
         self._receive = receive
         self._link_changed = link_changed
-        self._threads = [
-            threading.Thread(target=self._run, name="http-poll", daemon=True),
-            threading.Thread(target=self._send, name="http-send", daemon=True),
-        ]
         for thread in self._threads:
             thread.start()
 
@@ -118,7 +128,7 @@ class HttpTransport:
         self._stopping.set()
         self._interrupt.set()
         self._queue.close()
-        others = [thread for thread in self._threads if thread is not threading.current_thread()]
+        others = [thread for thread in self._threads if not thread.is_current()]
         deadline_s = time.monotonic() + _DISCONNECT_S
         while any(thread.is_alive() for thread in others) and time.monotonic() < deadline_s + _DISCONNECT_S:
             # Repeatedly: a call may be about to start.
@@ -134,6 +144,7 @@ class HttpTransport:
         back_off = BackOff()
         while not self._stopping.is_set():
             back_off.attempt()
+            self._poll_thread.beat()
             try:
                 self._connect()
                 self._poll()
@@ -188,6 +199,7 @@ class HttpTransport:
         """
         answered_s = time.monotonic()
         while not self._interrupt.wait(self._pause(answered_s)):
+            self._poll_thread.beat()
             started_s = time.monotonic()
             try:
                 commands = self._with_retry(lambda: self._request_commands(wait_s=self._wait_s))
@@ -258,6 +270,7 @@ class HttpTransport:
 
     def _send(self) -> None:
         while not self._stopping.is_set():
+            self._send_thread.beat()
             batch = self._queue.take(RESTING_HEARTBEAT_S if self._quiet() else MOVING_HEARTBEAT_S)
             if self._stopping.is_set():
                 self._queue.put_back(batch)
@@ -329,7 +342,7 @@ class HttpTransport:
             self._have.pop(codec.decode(payload, Ack).id, None)
 
     def _publish_offline(self) -> None:
-        self._threads[0].join(_DISCONNECT_S / 2)  # its presence must not follow the offline presence
+        self._poll_thread.join(_DISCONNECT_S / 2)  # its presence must not follow the offline presence
         if not self._announced_online:
             return
         batch = self._queue.take(0.0)

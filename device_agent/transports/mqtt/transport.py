@@ -15,6 +15,7 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
 from device_agent.ports.clock import wall_ms
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.ports.transport import LinkChanged, Receive
 from device_agent.protocol import KINDS, PROTOCOL, Presence, codec, topics
 from device_agent.transports import tls
@@ -40,6 +41,8 @@ _REFRESH_AT = 0.8
 _REFRESH_LATEST = 0.97
 _REFRESH_DEADLINE = 0.99
 """Share of the lifetime after which the connection ends even without new credentials."""
+_RESPONSE_S, _CONNECT_RESPONSE_S = 5.0, 60.0
+"""A connection, or an attempt to connect, without progress for this time hangs [s]."""
 _MAX_QUEUED = 2000
 _MAX_FILTERS = 8
 """Maximum number of filters per SUBSCRIBE; the limit of AWS IoT Core."""
@@ -152,7 +155,14 @@ class MqttTransport:
         self._connection: Connection | None = None
         self._up = False
         self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread = SupervisedThread(
+            self._run,
+            name="mqtt",
+            part="MQTT connection",
+            stopping=self._stopping,
+            recovery=Recovery.RESTART_OR_EXIT,
+            within_s=_RESPONSE_S,
+        )
         self._frames: dict[str, mqtt.MQTTMessageInfo] = {}
         self._confirmations = Confirmations()
         self._session = 0
@@ -165,7 +175,6 @@ class MqttTransport:
         """Implements ``Transport.start``."""
         self._receive = receive
         self._link_changed = link_changed
-        self._thread = threading.Thread(target=self._run, name="mqtt", daemon=True)
         self._thread.start()
 
     def publish(
@@ -194,7 +203,7 @@ class MqttTransport:
         self._stopping.set()
         if (connection := self._connection) is not None:
             connection.wake()
-        if self._thread is not None and self._thread is not threading.current_thread():
+        if not self._thread.is_current():
             self._thread.join(timeout=3)
 
     # ------------------------------------------------------------ connections
@@ -204,6 +213,7 @@ class MqttTransport:
         next_access: BrokerAccess | None = None
         while not self._stopping.is_set():
             back_off.attempt()
+            self._thread.beat(_CONNECT_RESPONSE_S)
             version, access, next_access = self._version, next_access, None
             try:
                 next_access = self._connect_once(access or self._access())
@@ -216,7 +226,9 @@ class MqttTransport:
             self._report_link_lost()
             if self._version is not version:
                 continue  # the broker is reachable, but supports only MQTT 3.1.1
-            if self._stopping.wait(back_off.wait_s()):
+            wait_s = back_off.wait_s()
+            self._thread.beat(wait_s + _RESPONSE_S)
+            if self._stopping.wait(wait_s):
                 break
         self._report_link_lost()
 
@@ -233,6 +245,7 @@ class MqttTransport:
             connection.open(access.host, access.port, keep_alive_s=KEEP_ALIVE_S)
             started_s = time.monotonic()
             while not self._lost.is_set() and not self._stopping.is_set():
+                self._thread.beat()
                 connection.turn(_POLL_S)
                 if self._up and connection.silent_s > SILENCE_TIMEOUT_S:
                     raise OSError(f"{access.host}:{access.port} sent nothing for {SILENCE_TIMEOUT_S:g} s")
@@ -372,16 +385,14 @@ class _Renewal:
 
     def __init__(self, access: Callable[[], BrokerAccess]) -> None:
         self._access = access
-        self._thread: threading.Thread | None = None
+        self._thread = SupervisedThread(self._request, name="mqtt-renewal", part="renewal of credentials")
         self._next_s = float("-inf")
         self.access: BrokerAccess | None = None
 
     def begin(self) -> None:
         """Request credentials, unless a request is running or failed recently."""
-        running = self._thread is not None and self._thread.is_alive()
-        if self.access is None and not running and time.monotonic() >= self._next_s:
+        if self.access is None and not self._thread.is_alive() and time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + _RENEWAL_RETRY_S
-            self._thread = threading.Thread(target=self._request, name="mqtt-renewal", daemon=True)
             self._thread.start()
 
     def _request(self) -> None:

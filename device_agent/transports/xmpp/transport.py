@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from xml.etree.ElementTree import Element
 
 from device_agent.ports.clock import wall_ms
+from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.ports.transport import LinkChanged, Receive
 from device_agent.protocol import KINDS, PROTOCOL, Presence, codec
 from device_agent.protocol.errors import ProtocolError
@@ -32,6 +33,8 @@ _POLL_S = 0.25
 _MAX_UNSENT_BYTES = 128 * 1024
 """Above this size of the send buffer, only the newest measurement per topic is kept [bytes]."""
 _UNSENT_POLL_S = 0.02
+_RESPONSE_S, _CONNECT_RESPONSE_S = 5.0, 60.0
+"""A connection, or an attempt to connect, without progress for this time hangs [s]."""
 _MAX_QUEUED_BYTES = 4 * 1024 * 1024
 """Maximum size of queued messages; more are rejected [bytes]."""
 SILENCE_TIMEOUT_S = stanzas.TIMEOUT_S + stanzas.PING_INTERVAL_S
@@ -82,14 +85,20 @@ class XmppTransport:
         self._listen = listen
         self._quiet = quiet
         self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread = SupervisedThread(
+            self._run,
+            name="xmpp",
+            part="XMPP connection",
+            stopping=self._stopping,
+            recovery=Recovery.RESTART_OR_EXIT,
+            within_s=_RESPONSE_S,
+        )
         self._link: _Link | None = None
 
     def start(self, receive: Receive, link_changed: LinkChanged) -> None:
         """Implements ``Transport.start``."""
         self._receive = receive
         self._link_changed = link_changed
-        self._thread = threading.Thread(target=self._run, name="xmpp", daemon=True)
         self._thread.start()
 
     def publish(
@@ -113,7 +122,7 @@ class XmppTransport:
         link = self._link
         if link is not None:
             link.wake()
-        if self._thread is not None and self._thread is not threading.current_thread():
+        if not self._thread.is_current():
             self._thread.join(timeout=3)
 
     # ------------------------------------------------------------ connections
@@ -122,6 +131,7 @@ class XmppTransport:
         back_off = BackOff()
         while not self._stopping.is_set():
             back_off.attempt()
+            self._thread.beat(_CONNECT_RESPONSE_S)
             try:
                 access = self._access()
                 asyncio.run(self._connect_once(access))
@@ -129,7 +139,9 @@ class XmppTransport:
                 _log.warning("no link: %s", error)
             except Exception:  # noqa: BLE001 (the transport must keep reconnecting after any error)
                 _log.exception("no link")
-            if self._stopping.wait(back_off.wait_s()):
+            wait_s = back_off.wait_s()
+            self._thread.beat(wait_s + _RESPONSE_S)
+            if self._stopping.wait(wait_s):
                 return
 
     async def _connect_once(self, access: XmppAccess) -> None:
@@ -142,6 +154,7 @@ class XmppTransport:
             while not self._stopping.is_set() and not self._renewal_due(
                 time.monotonic() - started_s, access.lifetime_s
             ):
+                self._thread.beat(_CONNECT_RESPONSE_S if link.peer is None else _RESPONSE_S)
                 if staying.done():
                     staying.result()
                 if link.peer is None and await self._announce(link):

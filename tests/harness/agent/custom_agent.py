@@ -43,7 +43,7 @@ _ACCESS = "access.json"
 _KINDS = (topics.STATE, topics.ACK, topics.EVENT)
 
 
-class _Api:
+class FileApi:
     """Replaces the HTTP API; reads the credentials from a file."""
 
     server = "http://server.invalid"
@@ -253,5 +253,5 @@ class Sensor:
 
 
 if __name__ == "__main__":
-    with mock.patch.object(bootstrap, "cloud_client", lambda store, _configuration, clock, **_: _Api(store, clock)):
+    with mock.patch.object(bootstrap, "cloud_client", lambda store, _configuration, clock, **_: FileApi(store, clock)):
         sys.exit(main(["run", "--home", sys.argv[1]]))

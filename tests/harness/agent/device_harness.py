@@ -39,6 +39,7 @@ from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.storage.journal import Journal
 from device_agent.runtime.storage.outbox_store import OutboxStore
+from device_agent.runtime.supervision import Supervisor
 from device_agent.runtime.telemetry.outbox import Outbox
 from tests.fakes.drivers import FakeDriver, robot_type
 from tests.harness.agent.pinned_keys import IDENTITY, pinned_keys_of
@@ -62,6 +63,7 @@ class DeviceHarness:
         sandbox: Sandbox | None = None,
         speech: Speech | None = None,
         uploads: Uploads | None = None,
+        supervisor: Supervisor | None = None,
     ) -> None:
         self.load = LoadGovernor()
         self.key = signing.generate()
@@ -101,6 +103,7 @@ class DeviceHarness:
             speech=speech,
             uploads=uploads,
             load=self.load,
+            supervisor=supervisor,
         )
 
     def start(self) -> None:

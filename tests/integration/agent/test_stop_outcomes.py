@@ -19,11 +19,12 @@ from tests.harness.network.brokers import wait_until
 from tests.harness.paths import ROOT
 
 
-def paired_arm(processes: CloudProcesses, folder: Path) -> str:
+def paired_arm(processes: CloudProcesses, folder: Path, *, transport: str = "mqtt") -> str:
     """Pair an agent with a simulated arm; returns the id of the arm."""
     store = IdentityStore(folder)
     key = store.private_key(create=True)
-    config = AgentConfig(server=processes.url, name="lab", devices=(DeviceEntry(name="arm", type="ur5"),))
+    arm = DeviceEntry(name="arm", type="ur5")
+    config = AgentConfig(server=processes.url, name="lab", devices=(arm,), transport=transport)
     config.save(store.folder)
     api = CloudClient(processes.url, key, CloudClock())
     claim = api.enroll(

@@ -158,7 +158,7 @@ def test_a_journal_error_at_shutdown_is_an_event(harness: DeviceHarness) -> None
 def test_an_unexpected_error_does_not_end_the_command_processor(
     harness: DeviceHarness, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def mistake(_: object) -> None:
+    def mistake(*_: object, **__: object) -> None:
         raise RuntimeError("a mistake")
 
     with monkeypatch.context() as patch:

@@ -251,7 +251,9 @@ export interface Geometry {
 }
 
 /**
- * `state`: the current condition. Retained; published on change and every 30 s, at most once per second.
+ * `state`: the current condition. Retained; published on change and every 30 s.
+ *
+ * It is published at most once per second, and at once for a new fault.
  *
  * Attributes:
  * ended_epoch: Highest epoch that the device no longer accepts. It only rises, so even an outdated message

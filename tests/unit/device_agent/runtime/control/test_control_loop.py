@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -219,7 +220,7 @@ def moving(monkeypatch: pytest.MonkeyPatch) -> LoopFixture:
     setup, clock = LoopFixture(InlineDriver(), period_ms=4), ManualTime()
     monkeypatch.setattr(module, "time", clock)
     setup.loop._next_s = clock.now_s
-    setup.loop._thread = threading.current_thread()
+    setup.loop._thread = mock.Mock(responsive=True)
     setup.loop._ran_early = True
     setup.send_setpoint(2.5)
     for _ in range(20):
