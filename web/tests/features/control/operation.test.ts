@@ -86,6 +86,8 @@ describe("stop", () => {
     deliver("state", state(0, null, { mode: "idle", stop: latch }));
     expect(stop.state.value.kind).toBe("sent");
     deliver("state", state(0, null, { mode: "fault", stop: latch }));
+    expect(stop.state.value.kind).toBe("sent");
+    deliver("state", state(0, null, { mode: "stopped", stop: latch }));
     expect(stop.state.value.kind).toBe("latched");
   });
 

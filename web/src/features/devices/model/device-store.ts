@@ -15,8 +15,8 @@ import { deviceTopics, type DeviceTopics } from "../../../shared/mqtt/topics";
 /** `unknown`: this page has no broker connection. */
 export type Reach = "online" | "stale" | "offline" | "unknown";
 
-/** On its own page, a device without telemetry for this long is stale [ms]. */
-const STALE_MS = 1_000;
+/** On its own page, a device without telemetry for this long is stale [ms]. With the clock's period it is shown within a second. */
+const STALE_MS = 700;
 /** The list receives only `state`, every 30 s: two missed messages and a margin [ms]. */
 const LIST_STALE_MS = 65_000;
 const MAX_EVENTS = 20;
@@ -122,7 +122,7 @@ export class DeviceStore {
     const newest = latest !== undefined && (state === null || latest.tick_ms >= state.tick_ms) ? latest : state;
     if (newest?.mode === "stopped") return "applied";
     if (state === null || newest !== state || (state.stop ?? null) === null) return "none";
-    return state.mode === "fault" ? "applied" : "pending";
+    return "pending";
   });
 
   /** Whether the displayed state is current. */
@@ -134,7 +134,7 @@ export class DeviceStore {
   /** Active restrictions of its motion, as the device reports them. */
   readonly limited = computed(() => this.#telemetry.value?.message.limited.join(", ") ?? "");
 
-  /** Whether the control loop has applied Stop, or a faulty device has latched it, according to the newest message. */
+  /** Whether the control loop has applied Stop, according to the newest message. A faulty device cannot apply it. */
   readonly stopped = computed(() => this.#stop.value === "applied");
 
   /** Whether Stop is latched, but the control loop has not applied it. */
