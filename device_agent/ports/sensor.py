@@ -182,6 +182,8 @@ class Movable(RoomDriver, Protocol):
     def hold(self) -> None:
         """Stop all motion. Fast; called at Stop, at a hold of the room and at a fault.
 
+        Usually the device's own thread calls it; if that has ended or hangs, another one does.
+
         Raises:
             SensorError: The device failed.
         """

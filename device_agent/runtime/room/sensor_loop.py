@@ -102,11 +102,16 @@ class SensorLoop:
     def fail(self, message: str) -> None:
         """Hold moving parts without the loop, which has ended or hangs. If it responds again, it reconnects."""
         self._controller.set_fault(message)
+        self._hold()
+
+    def _hold(self) -> None:
         with contextlib.suppress(SensorError):
             self._room_device.hold()
 
     def wake(self) -> None:
-        """See ``ControlLoop.wake``: a room device has no setpoints."""
+        """Hold moving parts at a Stop if the loop has ended or hangs. A room device has no setpoints."""
+        if self._controller.stop_pending and not self._thread.responsive:
+            self._hold()
 
     def _run(self) -> None:
         while not self._stopping.is_set():

@@ -16,9 +16,11 @@ from typing import Any
 
 import pytest
 
+from device_agent.ports import threads
 from device_agent.protocol import Ack, AckStatus, Event, Fault, Measurements, Mode, State, codec, topics
 from function_app.domain.common.ids import command_id
 from function_app.ports.command_bus import BusUnavailable
+from tests.harness.agent.thread_crashes import crash
 from tests.harness.cloud.cloud_processes import CloudProcesses, Link
 from tests.harness.network.brokers import BrokerKind, wait_until
 
@@ -82,6 +84,18 @@ class TransportSuite:
         wait_until(lambda: len(link.published(topics.EVENT)) == len(events), "all events")
         assert link.published(topics.EVENT) == events
         assert sorted(acknowledged) == list(range(len(events)))
+
+    def test_a_thread_that_crashed_can_be_started_again(self, processes: CloudProcesses, link: Link) -> None:
+        others = threads.watched()
+        link.quiet = False
+        link.start().up()
+        own = [thread for thread in threads.watched() if thread not in others]
+        for number, thread in enumerate(own):
+            crash(thread, wake=partial(processes.send, link.robot, b'{"before":%d}' % number))
+            assert thread.failed
+            thread.start()
+            _require_both_directions(processes, link, number)
+        assert own
 
     def test_the_largest_retained_message_arrives(self, processes: CloudProcesses, link: Link) -> None:
         link.start().up()
@@ -247,3 +261,13 @@ def _reformat(payload: bytes) -> bytes:
 
 def _now_ms() -> int:
     return time.time_ns() // 1_000_000
+
+
+def _require_both_directions(processes: CloudProcesses, link: Link, number: int) -> None:
+    """Wait until an event is acknowledged, and a command that is sent then arrives."""
+    acknowledged, event = threading.Event(), codec.encode(_event(number, "x"))
+    wait_until(lambda: link.publish(topics.EVENT, event, acknowledged.set), "the link")
+    wait_until(acknowledged.is_set, "an acknowledgement")
+    command = b'{"after":%d}' % number
+    processes.send(link.robot, command)
+    wait_until(lambda: any(payload == command for _, payload in link.received), "a command")

@@ -1,6 +1,7 @@
 """Ends supervised threads by an exception that no loop handles."""
 
 import threading
+from collections.abc import Callable
 
 from device_agent.ports.threads import SupervisedThread
 from tests.harness.network.brokers import wait_until
@@ -10,8 +11,8 @@ class InjectedCrash(BaseException):
     """An error that no loop handles."""
 
 
-def crash(thread: SupervisedThread) -> None:
-    """End a loop in its next iteration, and wait for the end."""
+def crash(thread: SupervisedThread, wake: Callable[[], object] = bool) -> None:
+    """End a loop in its next iteration, which ``wake`` starts, and wait for the end."""
     victim = thread._thread
     assert victim is not None
 
@@ -21,5 +22,6 @@ def crash(thread: SupervisedThread) -> None:
         SupervisedThread.beat(thread)  # the supervisor starts the thread again
 
     thread.beat = beat  # type: ignore[method-assign]
+    wake()
     wait_until(lambda: not victim.is_alive(), f"the end of {thread.name}")
     del thread.beat

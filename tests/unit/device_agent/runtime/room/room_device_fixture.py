@@ -12,6 +12,7 @@ from device_agent.protocol import Measurements, Stream, topics
 from device_agent.protocol.manifests.room import Control as RoomControl
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.runtime.room.room_device import RoomDevice
+from device_agent.runtime.supervision import Supervisor
 from tests.harness.agent.device_harness import DeviceHarness, eventually
 
 JPEG = b"\xff\xd8 a picture \xff\xd9"
@@ -111,12 +112,13 @@ class RoomDeviceHarness(DeviceHarness):
         interlocks: Sequence[InterlockRule] = (),
         broken: str = "",
         sensor: FakeSensor | None = None,
+        supervisor: Supervisor | None = None,
     ) -> None:
         self.sensor, self.uploads = sensor or FakeSensor(), FakeUploads()
         self.sensor.broken = broken
         self.room_device = RoomDevice(self.sensor, entry, self.uploads if uploads else None)
         driver: Any = self.room_device
-        super().__init__(folder, driver=driver, kind=entry.robot_type(), interlocks=interlocks)
+        super().__init__(folder, driver=driver, kind=entry.robot_type(), interlocks=interlocks, supervisor=supervisor)
         self.last_epoch = 0
 
     def command(self, request: Any, *, epoch: int | None = None, **fields: Any) -> str:

@@ -13,7 +13,9 @@ from device_agent.protocol.events import EventKind
 from device_agent.protocol.manifests.room import Watch
 from device_agent.runtime.commands import command_processor
 from device_agent.runtime.errors import INTERNAL_ERROR
+from device_agent.runtime.supervision import Supervisor
 from tests.harness.agent.device_harness import eventually, wait_for_state
+from tests.harness.agent.thread_crashes import crash
 from tests.unit.device_agent.runtime.room.conftest import MakeRoomDevice
 from tests.unit.device_agent.runtime.room.room_device_fixture import ENTRY, RoomDeviceHarness, await_growth
 
@@ -103,3 +105,20 @@ def test_an_interlock_holds_a_room_device(make_room_device: MakeRoomDevice) -> N
     harness = make_room_device(interlocks=(rule,))
     assert harness.failed(SET).code == "interlock"
     assert harness.sensor.holds == 1
+
+
+def test_a_dead_loop_holds_at_a_stop_is_reported_and_is_started_again(make_room_device: MakeRoomDevice) -> None:
+    supervisor = Supervisor()
+    harness = make_room_device(supervisor=supervisor)
+    supervisor.check()
+    crash(harness.device._loop._thread)
+    harness.receive_stop()
+    assert harness.sensor.holds == 1
+    assert supervisor.check() == ""
+    harness.sensor.broken = "no answer"
+    state = wait_for_state(harness, lambda state: any(fault.code == "agent.sensor-loop" for fault in state.faults))
+    assert state.mode is Mode.FAULT
+    harness.sensor.broken = ""
+    eventually(lambda: not supervisor.check() and harness.events(EventKind.PART_RECOVERED))
+    wait_for_state(harness, lambda state: not state.faults and state.mode is Mode.STOPPED)
+    await_growth(harness.measured)
