@@ -1,7 +1,8 @@
 """Ends supervised threads by an exception that no loop handles."""
 
+import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from device_agent.ports.threads import SupervisedThread
 from tests.harness.network.brokers import wait_until
@@ -25,3 +26,21 @@ def crash(thread: SupervisedThread, wake: Callable[[], object] = bool) -> None:
     wake()
     wait_until(lambda: not victim.is_alive(), f"the end of {thread.name}")
     del thread.beat
+
+
+@contextlib.contextmanager
+def hanging(thread: SupervisedThread) -> Iterator[None]:
+    """Make a loop hang from its next iteration until the end of the block."""
+    hangs, answers = threading.Event(), threading.Event()
+
+    def beat(*_: object, **__: object) -> None:
+        hangs.set()
+        answers.wait()
+
+    thread.beat = beat  # type: ignore[method-assign]
+    try:
+        wait_until(hangs.is_set, f"{thread.name} to hang")
+        yield
+    finally:
+        answers.set()
+        del thread.beat

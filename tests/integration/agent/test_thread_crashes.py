@@ -26,7 +26,7 @@ from device_agent.runtime.supervision import CHECK_PERIOD_S, Failure
 from device_agent.runtime.telemetry import latency_probe
 from tests.fixtures.brokers import Brokers
 from tests.harness.agent.custom_agent import DEVICE, AgentProcess, FileApi
-from tests.harness.agent.thread_crashes import InjectedCrash, crash
+from tests.harness.agent.thread_crashes import InjectedCrash, crash, hanging
 from tests.harness.network.brokers import PATIENCE_S, RunningBroker
 
 MOTION: Mapping[str, MoveJoints | Drive] = {
@@ -45,6 +45,8 @@ MAX_REST_S = 2.5
 MAX_DETECTION_S = 1.0
 LOOP, COMMANDS, WORLD = f"{DEVICE}-loop", f"{DEVICE}-commands", "mujoco-world"
 CONFIRMS_NO_STOP = {LOOP, COMMANDS}
+HANGING_S = {LOOP: 1.0, COMMANDS: 3.3, "mqtt": 5.3, WORLD: 2.3}
+"""Essential thread → maximum time until the supervisor notices that it hangs."""
 
 
 class MovingAgent(AgentProcess):
@@ -242,3 +244,23 @@ def test_a_hanging_driver_of_a_moving_robot_is_reported_within_a_second(
         assert agent.speed() <= MOVING
         assert agent.reason == ""
     print(f"{robot}: noticed {detection_s:.2f} s, rest {rest_s:.2f} s")
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("name", HANGING_S)
+def test_an_essential_thread_of_a_moving_robot_may_hang(name: str, tmp_path: Path, brokers: Brokers) -> None:
+    with moving_agent(tmp_path, brokers("mosquitto"), "ur5") as agent:
+        began_s = agent.time_s
+        with hanging(agent.threads()[name]):
+            agent.wait(lambda: agent.failures, "the hang to be noticed")
+            detection_s = agent.time_s - began_s
+            assert detection_s <= HANGING_S[name]
+            agent.wait(lambda: agent.device._controller.lease(time.monotonic()) is None, "the end of the lease")
+            stop = agent.command(StopDevice())
+            agent.check()
+            assert not agent.confirmed(stop)
+        agent.wait(lambda: agent.confirmed(stop), "a confirmed Stop")
+        agent.wait(lambda: EventKind.PART_FAILED in agent.reports(), "the report")
+        assert agent.final_ack(agent.action).status is AckStatus.FAILED
+        assert agent.reason == ""
+    print(f"ur5, {name} hangs: noticed {detection_s:.2f} s")
