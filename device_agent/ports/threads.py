@@ -124,7 +124,7 @@ class SupervisedThread:
     def _run(self) -> None:
         try:
             self._target()
-        except BaseException as error:  # noqa: BLE001 (the supervisor reports every end, whatever its cause)
+        except BaseException as error:  # noqa: BLE001 (the supervisor reports every end)
             _log.exception("thread %s", self.name)
             self.error = error
         if self.error is None and (self._stopping is None or self._stopping.is_set()):

@@ -1,6 +1,6 @@
 """Each thread of a real agent crashes or hangs while its robot moves: the robot rests, and the fault is reported.
 
-The threads are listed by the running agent itself. A thread that nobody supervises fails the test.
+The running agent itself lists the threads. A thread without supervision fails the test.
 """
 
 import contextlib

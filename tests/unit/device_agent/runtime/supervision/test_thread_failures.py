@@ -17,7 +17,7 @@ from tests.harness.agent.device_harness import DeviceHarness, eventually, wait_f
 from tests.harness.agent.thread_crashes import InjectedCrash, crash
 from tests.unit.device_agent.runtime.conftest import MakeDevice
 from tests.unit.device_agent.runtime.test_device import grant
-from tests.unit.device_agent.runtime.test_stop_confirmation import HangingDriver
+from tests.unit.device_agent.runtime.supervision.test_stop_confirmation import HangingDriver
 
 MOVE = MoveJoints(position_rad={"elbow": 2.5}, speed=0.1)
 
