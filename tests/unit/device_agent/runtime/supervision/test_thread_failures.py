@@ -175,7 +175,7 @@ def test_a_crashed_task_is_reported_once_and_its_fault_ends(setup: Setup) -> Non
 
 
 def test_an_action_whose_thread_crashes_is_failed(harness: DeviceHarness) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise InjectedCrash
 
     with mock.patch.object(RobotApi, "move_joints", fail):
