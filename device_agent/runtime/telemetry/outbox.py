@@ -40,8 +40,8 @@ _MAX_INCOMING = 5000
 _SAVE_RETRY_S = 5.0
 _PERIOD_S = 0.25
 _DRAIN_S = 0.5
-_RESPONSE_S = 15.0
-"""An outbox without progress for this time hangs [s]; a slow disk may delay it for seconds."""
+_RESPONSE_S = 60.0
+"""An outbox without progress for this time hangs [s]; opening a large file on a slow disk takes long."""
 _log = logging.getLogger(__name__)
 
 
