@@ -16,8 +16,8 @@ from device_agent.runtime.supervision import Supervisor
 from tests.harness.agent.device_harness import DeviceHarness, eventually, wait_for_state
 from tests.harness.agent.thread_crashes import InjectedCrash, crash
 from tests.unit.device_agent.runtime.conftest import MakeDevice
-from tests.unit.device_agent.runtime.test_device import grant
 from tests.unit.device_agent.runtime.supervision.test_stop_confirmation import HangingDriver
+from tests.unit.device_agent.runtime.test_device import grant
 
 MOVE = MoveJoints(position_rad={"elbow": 2.5}, speed=0.1)
 
@@ -90,9 +90,11 @@ def test_a_stop_of_a_dead_control_loop_halts_the_driver_at_once(setup: Setup) ->
 
 
 def test_a_driver_that_cannot_be_halted_does_not_prevent_the_report(setup: Setup) -> None:
-    crash(setup.device._loop._thread)
+    setup.driver.answers.clear()
     with mock.patch.object(setup.driver, "halt", side_effect=DriverError("no answer")):
         assert setup.state("agent.control-loop").mode is Mode.FAULT
+        setup.driver.answers.set()
+        setup.supervise(lambda: setup.device._controller.fault is None)
 
 
 def test_a_hanging_control_loop_is_halted_and_starts_at_rest_when_it_responds(setup: Setup) -> None:
