@@ -156,12 +156,7 @@ class MqttTransport:
         self._up = False
         self._stopping = threading.Event()
         self._thread = SupervisedThread(
-            self._run,
-            name="mqtt",
-            part="MQTT connection",
-            stopping=self._stopping,
-            recovery=Recovery.RESTART_OR_EXIT,
-            within_s=_RESPONSE_S,
+            self._run, name="mqtt", part="MQTT connection", stopping=self._stopping, recovery=Recovery.RESTART_OR_EXIT
         )
         self._frames: dict[str, mqtt.MQTTMessageInfo] = {}
         self._confirmations = Confirmations()
@@ -245,7 +240,7 @@ class MqttTransport:
             connection.open(access.host, access.port, keep_alive_s=KEEP_ALIVE_S)
             started_s = time.monotonic()
             while not self._lost.is_set() and not self._stopping.is_set():
-                self._thread.beat()
+                self._thread.beat(_RESPONSE_S)
                 connection.turn(_POLL_S)
                 if self._up and connection.silent_s > SILENCE_TIMEOUT_S:
                     raise OSError(f"{access.host}:{access.port} sent nothing for {SILENCE_TIMEOUT_S:g} s")
