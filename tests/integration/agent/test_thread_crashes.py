@@ -30,7 +30,7 @@ from tests.harness.agent.thread_crashes import InjectedCrash, crash, hanging
 from tests.harness.network.brokers import PATIENCE_S, RunningBroker
 
 MOTION: Mapping[str, MoveJoints | Drive] = {
-    "ur5": MoveJoints(position_rad={"shoulder_pan": 3.0}, speed=0.2),
+    "ur5": MoveJoints(position_rad={"shoulder_pan": 6.0}, speed=0.08),
     "qbo": Drive(forward_m_s=0.2, duration_s=60.0),
     "nao": Drive(forward_m_s=0.05, duration_s=60.0),
 }
