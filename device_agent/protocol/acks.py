@@ -33,10 +33,14 @@ TERMINAL = frozenset({AckStatus.DONE, AckStatus.FAILED, AckStatus.EXPIRED, AckSt
 
 
 class Reason(Struct, frozen=True, kw_only=True):
-    """Why a command ended: a code for programs, and a message for people that names the remedy."""
+    """Why a command ended: a code for programs, and a message for people that names the remedy.
+
+    ``epoch``: highest epoch that the device has seen, if it rejected the command because of its epoch; otherwise 0.
+    """
 
     code: Label
     message: Text
+    epoch: Count = 0
 
 
 class Ack(Struct, frozen=True, kw_only=True):

@@ -12,16 +12,22 @@ from device_agent.protocol import (
     Ack,
     AckStatus,
     Command,
+    GrantLease,
     Presence,
     Reason,
+    ReleaseLease,
+    ResetStop,
     RunMovement,
     State,
     Stop,
+    StopDevice,
     Task,
     codec,
     topics,
 )
 from device_agent.protocol.security import signing
+from device_agent.runtime.authority.lease_gate import LeaseGate
+from device_agent.runtime.errors import Refused
 from function_app.domain.common.ids import agent_id
 from function_app.entrypoints.http.framework.routing import PREFIX
 from tests.harness.network.brokers import Client, Message
@@ -41,6 +47,7 @@ class Robot:
     Attributes:
         reports: Returns the acks of a new action. Tests may replace it.
         silent: Send no acks.
+        gate: Rejects outdated epochs, as a device does; ``None``: accepts every epoch.
     """
 
     def __init__(self, cloud: "Cloud", names: tuple[str, ...]) -> None:
@@ -53,6 +60,7 @@ class Robot:
         self.space = ""
         self.session = 0
         self.silent = False
+        self.gate: LeaseGate | None = None
         self.reports: Callable[[Command], Acks] = lambda _: (AckStatus.RECEIVED, AckStatus.ACCEPTED, AckStatus.STARTED)
         self.commands: list[Command] = []
         self.payloads: dict[str, list[bytes]] = {}
@@ -173,7 +181,7 @@ class Robot:
         seen = self.payloads.setdefault(command.id, [])
         seen.append(message.payload)
         topic_of_acks = topics.device(topic.space, topic.agent, topic.device, topics.ACK)
-        if len(seen) > 1:
+        if len(seen) > 1 and not self._rejected_before(command):
             if command.id in self._last_acks and not self.silent and self.link is not None:
                 self.link.publish(topic_of_acks, self._last_acks[command.id])
             return
@@ -184,10 +192,28 @@ class Robot:
         reports: Acks = self.reports(command) if action else (AckStatus.RECEIVED, AckStatus.DONE)
         if action and self.cloud.clock.now_ms() > command.issued_at_ms + command.ttl_ms:
             reports = (AckStatus.EXPIRED,)
-        for each in reports:
+        for each in self._rejection(command) or reports:
             ack = each if isinstance(each, Ack) else self.ack(command.id, each)
             self._last_acks[command.id] = codec.encode(ack)
             self.link.publish(topic_of_acks, self._last_acks[command.id])
+
+    def _rejection(self, command: Command) -> tuple[AckStatus | Ack, ...]:
+        """The acks of a command with an outdated epoch; empty if the device accepts it."""
+        if self.gate is None:
+            return ()
+        try:
+            _apply_epoch(self.gate, command)
+        except Refused as refused:
+            reason = Reason(code=refused.code, message=refused.message, epoch=self.gate.epoch)
+            return AckStatus.RECEIVED, self.ack(command.id, AckStatus.FAILED, reason=reason)
+        return ()
+
+    def _rejected_before(self, command: Command) -> bool:
+        """Whether a rejected command was sent again with an epoch that the device has not seen."""
+        if self.gate is None or command.epoch <= self.gate.epoch:
+            return False
+        reason = codec.decode(self._last_acks[command.id], Ack).reason
+        return reason is not None and reason.epoch > 0
 
     def __enter__(self) -> Self:
         return self
@@ -195,6 +221,22 @@ class Robot:
     def __exit__(self, *_: object) -> None:
         if self.link is not None:
             self.link.close()
+
+
+def _apply_epoch(gate: LeaseGate, command: Command) -> None:
+    """Apply a command to the epochs of a device. Raises ``Refused``."""
+    match command.request:
+        case GrantLease(lease_ms=lease_ms):
+            gate.grant(epoch=command.epoch, holder="", lease_s=lease_ms / 1000, now_s=0)
+        case StopDevice():
+            gate.burn()
+        case ReleaseLease() | ResetStop():
+            gate.fence(command.epoch)
+            gate.burn()
+        case request if isinstance(request, Task | RunMovement):
+            gate.fence(command.epoch)
+            if command.epoch <= gate.burned:
+                raise Refused("lease_ended", f"lease {command.epoch} has ended at the device")
 
 
 def replace_ack(ack: Ack, changes: dict[str, Any]) -> Ack:

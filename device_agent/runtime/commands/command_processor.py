@@ -52,6 +52,8 @@ _FUTURE_MS = 2000
 _MAX_WAITING = 1000
 FAULT_STABLE_S = 30.0
 """A fault is cleared when its condition has been absent for this long [s]."""
+_OUTDATED = frozenset({"stale_epoch", "lease_ended"})
+"""Codes of commands whose epoch the device no longer accepts; the cloud needs the device's epoch."""
 _DRIVER = "driver"
 """Code of the driver's error."""
 COMMAND_PROCESSOR = "command processor"
@@ -200,7 +202,7 @@ class CommandProcessor:
             self._record_rejection("wrong_address", "it is addressed to another device", command)
             return
         first = self._publisher.create_ack(command.id, AckStatus.RECEIVED)
-        previous = self._journal.begin(self._name, first)
+        previous = self._journal.begin(self._name, first, epoch=command.epoch)
         if previous is not None:
             self._publisher.send_ack(previous)
             return
@@ -218,7 +220,9 @@ class CommandProcessor:
 
     def _reject(self, command: Command, refused: Refused) -> None:
         status = AckStatus.EXPIRED if refused.code == "expired" else AckStatus.FAILED
-        self._publisher.report(command.id, status, reason=Reason(code=refused.code, message=refused.message[:2000]))
+        epoch = self._controller.epochs[0] if refused.code in _OUTDATED else 0
+        reason = Reason(code=refused.code, message=refused.message[:2000], epoch=epoch)
+        self._publisher.report(command.id, status, reason=reason)
         self._record_rejection(refused.code, refused.message[:2000], command)
 
     def _record_rejection(self, code: str, message: str, command: Command | None = None) -> None:

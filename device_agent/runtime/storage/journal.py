@@ -84,15 +84,17 @@ class Journal:
                 self._database.close()
                 self._database = None
 
-    def begin(self, device: str, ack: Ack) -> Ack | None:
+    def begin(self, device: str, ack: Ack, *, epoch: int = 0) -> Ack | None:
         """Record a command before it is processed; see ``sync``.
 
         Args:
             device: Name of the device.
             ack: Its first ack.
+            epoch: Its epoch.
 
         Returns:
-            ``None`` for a new command. For a duplicate, its last ack: it must not be processed again.
+            ``None`` for a new command, and for one that was rejected because of its epoch and now has a higher one than
+            the device had seen: it has not run. For a duplicate, its last ack: it must not be processed again.
         """
         with self._lock:
             rows = self._execute(
@@ -101,7 +103,14 @@ class Journal:
             )
             if rows:
                 return None
-            return codec.decode(self._execute("SELECT last_ack FROM commands WHERE id = ?", (ack.id,))[0][0], Ack)
+            last = codec.decode(self._execute("SELECT last_ack FROM commands WHERE id = ?", (ack.id,))[0][0], Ack)
+            if last.reason is None or not 0 < last.reason.epoch < epoch:
+                return last
+            self._execute(
+                "UPDATE commands SET last_ack = ?, terminal = ?, delivered = 0, at_ms = ? WHERE id = ?",
+                (codec.encode(ack), ack.status.terminal, ack.at_ms, ack.id),
+            )
+            return None
 
     def record(self, ack: Ack) -> None:
         """Record the newest ack of a command; a terminal ack is on disk when this returns."""

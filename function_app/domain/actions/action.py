@@ -76,6 +76,7 @@ class Action:
         sequence: Sequence number of the newest ack.
         cancel_id: Id of the command that cancels it; empty: not cancelled.
         idempotency_key: Key of the row with its idempotency key, or empty.
+        reissuable: Whether its command may be issued once more with a higher epoch: the request named no epoch.
     """
 
     id: str
@@ -103,6 +104,7 @@ class Action:
     timeout_ms: int = 0
     queued_until_ms: int = 0
     turn_ms: int = 0
+    reissuable: bool = False
 
     @property
     def issued_ms(self) -> int:
@@ -124,7 +126,8 @@ class Action:
 class AckReport:
     """An ack of an action. ``output`` is the complete output of the script so far.
 
-    ``received_ms``: reception in the cloud, by the cloud clock [ms since 1970]; 0: unknown.
+    ``received_ms``: reception in the cloud, by the cloud clock [ms since 1970]; 0: unknown. ``device_epoch``: highest
+    epoch of the device, if it rejected the command because of its epoch; otherwise 0.
     """
 
     status: Status
@@ -135,6 +138,7 @@ class AckReport:
     output: str = ""
     result: dict[str, Any] = field(default_factory=dict)
     received_ms: int = 0
+    device_epoch: int = 0
 
 
 def apply_report(action: Action, report: AckReport) -> Action:
@@ -144,6 +148,8 @@ def apply_report(action: Action, report: AckReport) -> Action:
     if report.status is Status.EXPIRED and action.cancel_id:
         reason = {"code": "cancelled", "message": "Cancelled before the device received it."}
         report = replace(report, status=Status.CANCELLED, reason=reason)
+    if 0 < report.device_epoch < action.epoch:
+        return action  # the rejected command was issued again with a higher epoch
     times = action.times if report.status.value in action.times else {**action.times, report.status.value: report.at_ms}
     received, first_ms = action.received, action.received.get(report.status.value)
     if report.received_ms and (first_ms is None or report.received_ms < first_ms):
@@ -180,6 +186,17 @@ def give_turn(action: Action, epoch: int, now_ms: int) -> Action:
     times = {**action.times, Status.CREATED.value: now_ms}
     deadline_ms = now_ms + action.timeout_ms
     return replace(action, status=Status.CREATED, epoch=epoch, turn_ms=now_ms, deadline_ms=deadline_ms, times=times)
+
+
+def may_reissue(action: Action, device_epoch: int) -> bool:
+    """Whether the command, which the device rejected because of its epoch, may be issued with a higher one."""
+    return action.reissuable and not action.status.terminal and device_epoch >= action.epoch > 0
+
+
+def reissue(action: Action, epoch: int, now_ms: int) -> Action:
+    """The action when its rejected command is issued once more."""
+    rejected = replace(action, times={}, received={}, sequence=-1, reissuable=False)
+    return give_turn(rejected, epoch, now_ms)
 
 
 def end(action: Action, status: Status, code: str, message: str, now_ms: int) -> Action:

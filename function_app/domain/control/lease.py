@@ -98,6 +98,11 @@ class Lease:
 
 MIN_MS = 1_000
 """Shortest lease [ms]."""
+MAX_EPOCH_JUMP = 2**24
+"""Highest increase of an epoch to that of a device, because its reports are not signed.
+
+A forged report cannot exhaust the epochs (2⁵³): that takes 2²⁹ grants, each after another forged report.
+"""
 
 
 def granted_ms(lease_ms: int, left_ms: int) -> int:
@@ -156,6 +161,19 @@ def require_held(lease: Lease | None, caller: Identity, *, epoch: int, now_ms: i
 def release(lease: Lease, *, now_ms: int) -> Lease:
     """A free lease with the same epoch, so that the next epoch is higher."""
     return Lease(epoch=lease.epoch, pairing=lease.pairing, request=lease.closed_request(now_ms))
+
+
+def catch_up(lease: Lease | None, device_epoch: int, *, now_ms: int) -> Lease | None:
+    """The lease after the device has reported ``device_epoch``; unchanged if that is not higher.
+
+    Only a restored backup of the tables is behind the device. Its lease is not in force there, so it is free. Its epoch
+    is that of the device, at most ``MAX_EPOCH_JUMP`` higher, so that the next grant is accepted.
+    """
+    epoch = lease.epoch if lease is not None else 0
+    if device_epoch <= epoch:
+        return lease
+    caught_up = min(device_epoch, epoch + MAX_EPOCH_JUMP)
+    return replace(Lease(epoch=epoch) if lease is None else release(lease, now_ms=now_ms), epoch=caught_up)
 
 
 def invalidate(lease: Lease | None, *, pairing: str, now_ms: int) -> Lease:

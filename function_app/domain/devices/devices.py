@@ -219,6 +219,11 @@ class LastState:
     pairing: str = ""
 
     @property
+    def epoch(self) -> int:
+        """The highest epoch that the device has seen."""
+        return int(self.state.get("epoch", 0))
+
+    @property
     def ended_epoch(self) -> int:
         """The highest epoch that the device has ended."""
         return int(self.state.get("ended_epoch", 0))

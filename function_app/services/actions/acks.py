@@ -4,8 +4,6 @@ import asyncio
 from collections.abc import AsyncIterator, Iterable
 from typing import NamedTuple
 
-import msgspec
-
 from device_agent.protocol import Ack, codec
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.topics import Topic
@@ -63,6 +61,8 @@ class ActionAcks:
         if parts is None or parts[0] != device_id(topic.agent, topic.device):
             raise ProtocolError(f"'{ack.id}' is not a command of {topic.agent}/{topic.device}")
         ack_report = report(ack, self._clock.now_ms())
+        if await self._queues.reissue(ack.id, ack_report.device_epoch):
+            return
         stored = await self._queues.change(ack.id, lambda action: apply_report(action, ack_report))
         if stored is None:
             await self._answer(topic.agent, ack)
@@ -112,7 +112,10 @@ class ActionAcks:
             try:
                 async with asyncio.timeout(min(pause_s, left_s)):
                     reports.append(report(await anext(acks), self._clock.now_ms()))
-                if action.status is Status.QUEUED:  # an ack means that the action has left the queue
+                rejected = await self._queues.reissue(action.id, reports[-1].device_epoch)
+                if rejected:
+                    reports.clear()
+                if rejected or action.status is Status.QUEUED:  # an ack means that the action has left the queue
                     stored = await self._action_store.get(action.id) or stored
                     action = _applied(stored.action, reports)
                 else:
@@ -172,7 +175,8 @@ def report(ack: Ack, received_ms: int) -> AckReport:
         sequence=ack.sequence,
         at_ms=ack.at_ms,
         received_ms=received_ms,
-        reason=None if ack.reason is None else msgspec.to_builtins(ack.reason),
+        reason=None if ack.reason is None else {"code": ack.reason.code, "message": ack.reason.message},
+        device_epoch=0 if ack.reason is None else ack.reason.epoch,
         progress=ack.progress,
         output=ack.output,
         result={} if ack.result and too_deep(ack.result) else ack.result,

@@ -9,8 +9,9 @@ import logging
 from collections.abc import Callable, Collection
 from typing import Final
 
-from function_app.domain.actions.action import RETRY_MS, Action, Status, end, give_turn
+from function_app.domain.actions.action import RETRY_MS, Action, Status, end, give_turn, may_reissue, reissue
 from function_app.domain.actions.queue import DROPPED, ActionQueue
+from function_app.domain.common.ids import split_command
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import lease as rules
 from function_app.domain.control.lease import Lease
@@ -22,7 +23,7 @@ from function_app.ports.tables import Row, Tables, Write
 from function_app.services.actions.action_store import ActionStore, StoredAction
 from function_app.services.actions.dispatcher import ActionDispatcher, MovementUnavailable, PermissionEnded
 from function_app.services.control.control_events import ControlEvents, lease_change
-from function_app.services.devices.control_rows import apply_ended_epoch, read_control, read_control_rows
+from function_app.services.devices.control_rows import apply_device_epochs, read_control, read_control_rows
 from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
@@ -66,6 +67,68 @@ class ActionQueues:
         if stored is not None and stored.waited_for:
             await self.advance(stored.action.device)
         return stored
+
+    async def reissue(self, action: str, device_epoch: int) -> bool:
+        """Issue the command of an action once more, which the device rejected because of its epoch.
+
+        The tables were restored from a backup and are behind the device. The action gets a lease with a higher epoch
+        than the device has seen, so it runs. Its id is the same: a device runs a rejected command at most once.
+
+        Args:
+            action: Id of a command.
+            device_epoch: Highest epoch of the device; 0: it was not rejected because of its epoch.
+
+        Returns:
+            Whether the command was issued, by this call or another process. Otherwise the rejection is final: the
+            request named an epoch, the cloud has granted a newer lease, the device has ended the lease, or the
+            command was issued again before.
+        """
+        if not device_epoch:
+            return False
+        issued = await records.retry(lambda: self._issue_again(action, device_epoch))
+        if isinstance(issued, bool):
+            return issued
+        _log.warning("action %s: the device has epoch %d; issued again with a higher epoch", action, device_epoch)
+        await self._send(*issued)
+        return True
+
+    async def _issue_again(self, action_id: str, device_epoch: int) -> tuple[StoredAction, Device] | bool:
+        device_id, _ = split_command(action_id) or (action_id, "")
+        # Read before the action: if another process issues the command meanwhile, the action shows it.
+        control = await read_control_rows(self._tables, device_id)
+        stored = await self._action_store.get(action_id)
+        if stored is None:
+            return False
+        if not may_reissue(stored.action, device_epoch):
+            return stored.action.epoch > device_epoch
+        action = stored.action
+        try:
+            caller, device = await self._dispatcher.current_permissions(action)
+        except PermissionEnded:
+            return False
+        lease = control.lease
+        if lease is None or lease.epoch != action.epoch or (lease.action != action_id and device_epoch == lease.epoch):
+            return False
+        now_ms = self._clock.now_ms()
+        await self._reminders.schedule(action_id, now_ms + RETRY_MS)
+        higher = rules.acquire(
+            rules.catch_up(lease, device_epoch, now_ms=now_ms),
+            caller,
+            lease_ms=action.timeout_ms,
+            now_ms=now_ms,
+            pairing=device.pairing,
+            action=action_id,
+        )
+        issued = reissue(action, higher.epoch, now_ms)
+        rows = await self._tables.batch(
+            records.CONTROL,
+            [
+                Write("replace", stored.row.changed(records.to_data(issued))),
+                control.write_lease(device.id, higher),
+                *lease_change(device.id, lease, higher, caller=caller, now_ms=now_ms, owner=device.owner),
+            ],
+        )
+        return StoredAction(issued, rows[0]), device
 
     async def schedule_check(self, device: str) -> None:
         """Schedule a check of a device's queue; call it before the queue is written."""
@@ -156,15 +219,20 @@ class ActionQueues:
             await self._refuse(stored, Status.FAILED, problem.code, problem.detail)
             await self._control_events.record_rejection(device, caller, "start a queued action", problem)
             return True
-        if started is None:
-            return False
-        try:
-            await self._dispatcher.send(started, device)
-        except MovementUnavailable:
-            _log.warning("action %s: its script was deleted; the timer ends it", action.id)
-        except PermissionEnded as ended:
-            _log.warning("action %s: %s; the timer ends it", action.id, ended.why)
+        if started is not None:
+            await self._send(started, device)
         return False
+
+    async def _send(self, stored: StoredAction, device: Device) -> None:
+        """Publish the command of an action. Errors are logged; the timer retries or ends the action."""
+        try:
+            await self._dispatcher.send(stored, device)
+        except MovementUnavailable:
+            _log.warning("action %s: its script was deleted; the timer ends it", stored.action.id)
+        except PermissionEnded as ended:
+            _log.warning("action %s: %s; the timer ends it", stored.action.id, ended.why)
+        except BusUnavailable as error:
+            _log.warning("action %s: %s; the timer publishes it", stored.action.id, error)
 
     async def _start(self, stored: StoredAction, device: Device, caller: Identity) -> StoredAction | None:
         """Write slot, lease, queue and action in one batch; ``None``: another process was first."""
@@ -173,7 +241,7 @@ class ActionQueues:
         if control.action or control.queue.position(stored.action.id) != 1:
             return None
         now_ms = self._clock.now_ms()
-        control = await apply_ended_epoch(self._tables, device, control, caller, now_ms)
+        control = await apply_device_epochs(self._tables, device, control, caller, now_ms)
         lease = action_lease(
             control.lease,
             caller,

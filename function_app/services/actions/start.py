@@ -26,7 +26,7 @@ from function_app.services.actions.action_store import ActionStore, StoredAction
 from function_app.services.actions.queue import ActionQueues, action_lease
 from function_app.services.actions.requests import ActionRequest
 from function_app.services.control.control_events import ControlEvents, lease_change
-from function_app.services.devices.control_rows import ControlRows, apply_ended_epoch, read_control
+from function_app.services.devices.control_rows import ControlRows, apply_device_epochs, read_control
 from function_app.services.devices.device_access import DeviceAccess, require_online, require_operator
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.messaging.delivery import Delivery
@@ -160,6 +160,7 @@ class StartAction:
             idempotency_key=key,
             session=caller.session,
             timeout_ms=request.timeout_ms,
+            reissuable=request.epoch is None,
         )
         await self._reminders.schedule(action_id, now_ms + RETRY_MS)
         if request.policy == "queue":
@@ -242,7 +243,7 @@ class StartAction:
         async def attempt() -> tuple[StoredAction, bool]:
             now_ms = self._clock.now_ms()
             control = await read_control(self._tables, device)
-            control = await apply_ended_epoch(self._tables, device, control, caller, now_ms)
+            control = await apply_device_epochs(self._tables, device, control, caller, now_ms)
             if now_ms - draft.created_ms > ABANDON_MS:
                 raise busy_store()
             existing = await self._existing(device, request, draft.idempotency_key) if draft.idempotency_key else None

@@ -28,7 +28,7 @@ from function_app.services.control.lease_store import LeaseStore
 from function_app.services.devices.device_access import DeviceAccess, require_online, require_operator
 from function_app.services.devices.spaces import Spaces
 from function_app.services.messaging.command_sender import CommandSender
-from function_app.services.messaging.delivery import Delivery
+from function_app.services.messaging.delivery import Confirmation, Delivery
 
 REPEAT_S: Final = 0.2
 CONFIRM_MS: Final = 1_000
@@ -125,8 +125,17 @@ class StopDevices:
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "reset Stop"):
             require_operator(device)
+        result = await self._reset(caller, device)
+        if result.device_epoch:  # the tables were restored from a backup
+            result = await self._reset(caller, device, device_epoch=result.device_epoch)
+        return result.confirmed
+
+    async def _reset(self, caller: Identity, device: Device, *, device_epoch: int = 0) -> Confirmation:
         _, lease = await self._lease_store.change(
-            caller, device, lambda lease, now_ms: rules.invalidate(lease, pairing=device.pairing, now_ms=now_ms)
+            caller,
+            device,
+            lambda lease, now_ms: rules.invalidate(lease, pairing=device.pairing, now_ms=now_ms),
+            device_epoch=device_epoch,
         )
         await self._devices.require_still_allowed(caller, device)
         return await self._command_sender.send_confirmed(
@@ -166,7 +175,7 @@ class StopDevices:
             await asyncio.sleep(0)  # publish first, before signing and writing
             writing = asyncio.create_task(self._write(caller, device, reason, gate))
             order = StopDevice(reason=reason)
-            return await self._command_sender.send_confirmed(
+            result = await self._command_sender.send_confirmed(
                 device, order, caller=caller.name, epoch=0, wait_ms=CONFIRM_MS
             )
         finally:
@@ -175,6 +184,7 @@ class StopDevices:
                 await plain
             if writing is not None:
                 await writing
+        return result.confirmed
 
     async def _repeat(self, device: Device, author: str, stop: Stop) -> None:
         payload = codec.encode(stop)

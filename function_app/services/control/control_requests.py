@@ -22,6 +22,7 @@ from function_app.services.control.leases import Leases
 from function_app.services.devices.control_rows import read_lease
 from function_app.services.devices.device_access import DeviceAccess, require_operator
 from function_app.services.messaging.command_sender import CommandSender
+from function_app.services.messaging.delivery import Confirmation
 
 _log = logging.getLogger(__name__)
 
@@ -85,13 +86,13 @@ class ControlRequests:
             request=control_request.id, requester=printable(control_request.by), answer_within_ms=left_ms
         )
         try:
-            shown = await self._command_sender.send_confirmed(
+            confirmation = await self._command_sender.send_confirmed(
                 device, order, caller=caller.name, epoch=lease.epoch, wait_ms=wait_ms
             )
         except Problem as problem:
             _log.warning("request for %s: %s", device.id, problem.detail)
-            shown = False
-        return lease, control_request, control_request.id == created, shown
+            confirmation = Confirmation()
+        return lease, control_request, control_request.id == created, confirmation.confirmed
 
     async def accept(
         self, caller: Identity, device_id: str, request: str, *, wait_ms: int
@@ -116,11 +117,11 @@ class ControlRequests:
         if before is lease or before is None:
             # Accepted by an earlier call. Each renewal announces the lease to the device.
             return lease, control_request, False
-        confirmed, _ = await asyncio.gather(
+        confirmation, _ = await asyncio.gather(
             self._leases.grant(device, lease, by=caller.name, wait_ms=wait_ms),
             self._revocation.cut(device, before.epoch),
         )
-        return lease, control_request, confirmed
+        return lease, control_request, confirmation.confirmed
 
     async def reject(self, caller: Identity, device_id: str, request: str) -> tuple[Lease, ControlRequest]:
         """Reject the request.

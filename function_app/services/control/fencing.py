@@ -5,13 +5,13 @@ import logging
 
 from device_agent.protocol import ReleaseLease
 from function_app.domain.control.control_events import control_ended
-from function_app.domain.control.lease import Lease
+from function_app.domain.control.lease import Lease, catch_up
 from function_app.domain.devices.devices import Device
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.control.control_events import event_writes
-from function_app.services.devices.control_rows import read_control_rows
+from function_app.services.devices.control_rows import device_epoch, read_control_rows
 from function_app.services.identity.authenticator import everything
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.storage import records
@@ -45,21 +45,23 @@ class ControlRevocation:
             Whether broker and device were notified. The lease has ended in any case.
         """
 
-        async def attempt() -> Lease | None:
+        async def attempt() -> tuple[Lease, int] | None:
             control = await read_control_rows(self._tables, device.id)
             existing = control.lease
             if existing is None or not existing.account or existing.pairing != device.pairing:
                 return None
             if account not in {None, existing.account}:
                 return None
-            lease = Lease(epoch=existing.epoch + 1, pairing=device.pairing)
-            fact = control_ended(existing, lease, why=why, now_ms=self._clock.now_ms())
+            now_ms = self._clock.now_ms()
+            newest = catch_up(existing, await device_epoch(self._tables, device), now_ms=now_ms) or existing
+            lease = Lease(epoch=newest.epoch + 1, pairing=device.pairing)
+            fact = control_ended(existing, lease, why=why, now_ms=now_ms)
             facts = event_writes(device.id, device.pairing, [fact], owner=device.owner)
             await self._tables.batch(records.CONTROL, [control.write_lease(device.id, lease), *facts])
-            return lease
+            return lease, existing.epoch
 
-        lease = await records.retry(attempt)
-        return lease is None or await self._notify(device, lease, until_s)
+        revoked = await records.retry(attempt)
+        return revoked is None or await self._notify(device, *revoked, until_s)
 
     async def retry(self, device: Device, account: str, *, until_s: float) -> bool:
         """Notify broker and device again about the end of an account's lease; return whether it succeeded.
@@ -72,7 +74,7 @@ class ControlRevocation:
         if lease is None or lease.pairing != device.pairing:
             return True
         if not lease.account:
-            return await self._notify(device, lease, until_s)
+            return await self._notify(device, lease, lease.epoch - 1, until_s)
         try:
             async with asyncio.timeout_at(until_s):
                 await self._access.revoke(principal=everything(account))
@@ -81,12 +83,12 @@ class ControlRevocation:
             return False
         return True
 
-    async def _notify(self, device: Device, lease: Lease, until_s: float | None) -> bool:
-        """Cut the setpoint connection of the previous epoch and notify the device, concurrently."""
+    async def _notify(self, device: Device, lease: Lease, previous: int, until_s: float | None) -> bool:
+        """Cut the setpoint connection of the epoch ``previous`` and notify the device, concurrently."""
         try:
             async with asyncio.timeout_at(until_s):
                 release = self._command_sender.try_send(device, ReleaseLease(), caller="telescope", epoch=lease.epoch)
-                return all(await asyncio.gather(self.cut(device, lease.epoch - 1), release))
+                return all(await asyncio.gather(self.cut(device, previous), release))
         except TimeoutError:
             _log.warning("end of control of %s: the broker did not answer in time", device.id)
             return False

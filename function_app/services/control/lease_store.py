@@ -8,7 +8,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.control.control_events import ControlEvents, lease_change
-from function_app.services.devices.control_rows import apply_ended_epoch, read_control
+from function_app.services.devices.control_rows import apply_device_epochs, read_control
 from function_app.services.storage import records
 
 
@@ -21,12 +21,12 @@ class LeaseStore:
         self._clock = clock
 
     async def change(
-        self, caller: Identity, device: Device, change: Callable[[Lease | None, int], Lease]
+        self, caller: Identity, device: Device, change: Callable[[Lease | None, int], Lease], *, device_epoch: int = 0
     ) -> tuple[Lease | None, Lease]:
         """Apply ``change`` (of the lease, at a time) by ETag; return the lease before and after.
 
-        ``change`` returns the same object for no change, and may be called several times. Raises ``busy``, and the
-        problems of ``change``.
+        ``change`` returns the same object for no change, and may be called several times. ``device_epoch``: that of a
+        rejected command. Raises ``busy``, and the problems of ``change``.
         """
         watched = False
 
@@ -34,7 +34,7 @@ class LeaseStore:
             nonlocal watched
             control = await read_control(self._tables, device)
             now_ms = self._clock.now_ms()
-            control = await apply_ended_epoch(self._tables, device, control, caller, now_ms)
+            control = await apply_device_epochs(self._tables, device, control, caller, now_ms, reported=device_epoch)
             lease = change(control.lease, now_ms)
             if lease is control.lease:
                 return lease, lease

@@ -21,6 +21,7 @@ from function_app.services.control.lease_store import LeaseStore
 from function_app.services.devices.control_rows import ended_by_device, read_lease
 from function_app.services.devices.device_access import DeviceAccess, require_operator, require_owner
 from function_app.services.messaging.command_sender import CommandSender
+from function_app.services.messaging.delivery import Confirmation
 
 _log = logging.getLogger(__name__)
 
@@ -96,10 +97,15 @@ class Leases:
                 require_owner(device)
             before, lease = await self._lease_store.change(caller, device, changed)
             await self.require_still_allowed(caller, device)
-        confirmed = await self.grant(device, lease, by=caller.name, wait_ms=wait_ms)
+            result = await self.grant(device, lease, by=caller.name, wait_ms=wait_ms)
+            if result.device_epoch > lease.epoch or (result.device_epoch == lease.epoch and epoch is None):
+                # The tables were restored from a backup. A new lease gets a higher epoch; a renewed one is lost.
+                _, lease = await self._lease_store.change(caller, device, changed, device_epoch=result.device_epoch)
+                result = await self.grant(device, lease, by=caller.name, wait_ms=wait_ms)
         if before is not None and lease.reason and epoch is None:
             await self._revocation.cut(device, before.epoch)
-        return AcquiredLease(lease, confirmed, await self._setpoint_key(device, lease.epoch), device.streaming)
+        setpoint_key = await self._setpoint_key(device, lease.epoch)
+        return AcquiredLease(lease, result.confirmed, setpoint_key, device.streaming)
 
     async def _setpoint_key(self, device: Device, epoch: int) -> bytes:
         """The key of a lease. The device accepts it while it pins the signing key from which it is derived."""
@@ -138,7 +144,7 @@ class Leases:
             await self._revocation.revoke(device, UNSHARED, account=caller.account)
             raise
 
-    async def grant(self, device: Device, lease: Lease, *, by: str, wait_ms: int) -> bool:
+    async def grant(self, device: Device, lease: Lease, *, by: str, wait_ms: int) -> Confirmation:
         """Send the lease to the device; return whether it confirmed. The lease is valid in any case."""
         order = GrantLease(
             holder=printable(lease.holder), lease_ms=lease.lease_ms, reason=lease.reason, pairing=device.pairing
@@ -149,4 +155,4 @@ class Leases:
             )
         except Problem as problem:
             _log.warning("lease of %s: %s", device.id, problem.detail)
-            return False
+            return Confirmation()

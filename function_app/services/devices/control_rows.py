@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 
 from function_app.domain.actions.queue import ActionQueue
-from function_app.domain.control.lease import Lease, release
+from function_app.domain.control.lease import Lease, catch_up, release
 from function_app.domain.devices.devices import Device, LastState
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import Row, Tables, Write
@@ -69,30 +69,42 @@ async def read_control_rows(tables: Tables, device: str) -> ControlRows:
     )
 
 
-async def apply_ended_epoch(
-    tables: Tables, device: Device, control: ControlRows, caller: Identity, now_ms: int
+async def apply_device_epochs(
+    tables: Tables, device: Device, control: ControlRows, caller: Identity, now_ms: int, *, reported: int = 0
 ) -> ControlRows:
-    """The rows without the lease of another session that the device has ended, according to its ``state``.
+    """The rows with the epochs of the device: those in its ``state``, and ``reported`` from a rejected command.
 
-    A hold, Stop or restart ends leases at the device. An ended epoch is never accepted again, so an old state is still
-    valid.
+    A hold, Stop or restart ends leases at the device: the lease of another session is then free. An ended epoch is
+    never accepted again, so an old state is still valid. See also ``catch_up``.
     """
-    lease = control.lease
-    if lease is None or not lease.held_by_other(caller, now_ms) or not await ended_by_device(tables, device, lease):
-        return control
-    return replace(control, lease=release(lease, now_ms=now_ms))
+    last = await _last_state(tables, device)
+    lease = catch_up(control.lease, max(reported, last.epoch if last else 0), now_ms=now_ms)
+    if lease is not None and lease.held_by_other(caller, now_ms) and last is not None:
+        lease = release(lease, now_ms=now_ms) if last.ended_epoch >= lease.epoch else lease
+    return control if lease is control.lease else replace(control, lease=lease)
+
+
+async def device_epoch(tables: Tables, device: Device) -> int:
+    """The highest epoch in the ``state`` of the device; 0 if unknown."""
+    last = await _last_state(tables, device)
+    return last.epoch if last is not None else 0
 
 
 async def ended_by_device(tables: Tables, device: Device, lease: Lease) -> bool:
     """Whether the device has ended this lease."""
-    _, last = await records.find(tables, records.AGENTS, device.agent, f"state:{device.name}", LastState)
-    return last is not None and last.pairing == device.pairing and last.ended_epoch >= lease.epoch
+    last = await _last_state(tables, device)
+    return last is not None and last.ended_epoch >= lease.epoch
 
 
 async def read_lease(tables: Tables, device: Device) -> Lease | None:
     """The lease, live or not, without slot and queue."""
     row = await tables.get(records.CONTROL, device.id, LEASE)
     return _lease({LEASE: row} if row else {}, device)
+
+
+async def _last_state(tables: Tables, device: Device) -> LastState | None:
+    _, last = await records.find(tables, records.AGENTS, device.agent, f"state:{device.name}", LastState)
+    return last if last is not None and last.pairing == device.pairing else None
 
 
 async def _rows(tables: Tables, device: str) -> dict[str, Row]:

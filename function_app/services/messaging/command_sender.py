@@ -15,7 +15,7 @@ from function_app.domain.devices.devices import Device
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.signing_keys import SigningKeys
-from function_app.services.messaging.delivery import Delivery, SignedCommand
+from function_app.services.messaging.delivery import Confirmation, Delivery, SignedCommand
 
 SHORT_TTL_MS = 5_000
 """Time to live of lease and Stop commands. A later arrival must have no effect."""
@@ -109,7 +109,9 @@ class CommandSender:
             return False
         return True
 
-    async def send_confirmed(self, device: Device, request: Request, *, caller: str, epoch: int, wait_ms: int) -> bool:
+    async def send_confirmed(
+        self, device: Device, request: Request, *, caller: str, epoch: int, wait_ms: int
+    ) -> Confirmation:
         """Sign and send a short-lived command; return whether the device accepted it within ``wait_ms``.
 
         Raises:

@@ -10,18 +10,30 @@ mailbox covers outages of the broker or the gateway.
 import asyncio
 import contextlib
 from collections.abc import AsyncGenerator, AsyncIterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from device_agent.protocol import Ack, AckStatus, topics
 from function_app.domain.devices.devices import Device
 from function_app.ports.command_bus import CommandBus
 from function_app.services.messaging.broker_relay import BrokerRelay
-from function_app.services.messaging.mailbox import Mailbox
+from function_app.services.messaging.mailbox import Answer, Mailbox
 
 _POLL_S = 0.02
 _SLOWEST_POLL_S = 0.2
 CONFIRMING = frozenset({AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE})
 """Confirming acks. All other decisive acks are terminal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Confirmation:
+    """Whether the device accepted a command in time.
+
+    ``device_epoch``: its highest epoch, if it rejected the command because of the epoch; otherwise 0.
+    """
+
+    confirmed: bool = False
+    device_epoch: int = 0
 
 
 class SignedCommand(NamedTuple):
@@ -90,7 +102,7 @@ class Delivery:
         else:
             yield None
 
-    async def send_confirmed(self, device: Device, signed: SignedCommand, *, wait_ms: int) -> bool:
+    async def send_confirmed(self, device: Device, signed: SignedCommand, *, wait_ms: int) -> Confirmation:
         """Send a command; return whether the device accepted it within ``wait_ms``.
 
         Raises:
@@ -102,11 +114,12 @@ class Delivery:
             await self.send(device, signed)
             try:
                 async with asyncio.timeout(wait_ms / 1000):
-                    return await self._first_ack(device, signed.command, acks) in CONFIRMING
+                    status, epoch = await self._first_ack(device, signed.command, acks)
             except TimeoutError:
-                return False
+                return Confirmation()
+            return Confirmation(status in CONFIRMING, epoch)
 
-    async def _first_ack(self, device: Device, command: str, acks: AsyncIterator[Ack] | None) -> AckStatus:
+    async def _first_ack(self, device: Device, command: str, acks: AsyncIterator[Ack] | None) -> Answer:
         """The first decisive ack, from the broker or the tables."""
         if acks is None:
             return await self._stored_ack(device, command)
@@ -124,15 +137,15 @@ class Delivery:
     async def _relay_message(self, topic: str, payload: bytes) -> None:
         await self._relay.publish([(topic, topics.parse(topic), payload)])
 
-    async def _stored_ack(self, device: Device, command: str) -> AckStatus:
+    async def _stored_ack(self, device: Device, command: str) -> Answer:
         """The ack, when it is stored in the tables."""
         pause_s = _POLL_S
         with self._mailbox.changes(device.agent) as changed:
             while True:
                 changed.clear()
-                status = await self._mailbox.stored_ack(device.agent, command)
-                if status is not None:
-                    return status
+                answer = await self._mailbox.stored_ack(device.agent, command)
+                if answer is not None:
+                    return answer
                 # Not `wait_for`: it loses the caller's timeout if the event is set at that moment.
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(pause_s):
@@ -140,8 +153,8 @@ class Delivery:
                 pause_s = min(2 * pause_s, _SLOWEST_POLL_S)
 
 
-async def _decisive(acks: AsyncIterator[Ack]) -> AckStatus:
+async def _decisive(acks: AsyncIterator[Ack]) -> Answer:
     while True:
-        status = (await anext(acks)).status
-        if status in CONFIRMING or status.terminal:
-            return status
+        ack = await anext(acks)
+        if ack.status in CONFIRMING or ack.status.terminal:
+            return Answer.of(ack)

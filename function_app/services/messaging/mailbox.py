@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
 
 from device_agent.protocol import Ack, AckStatus
 from function_app.domain.common.ids import oldest_first, split_command
@@ -42,6 +43,19 @@ class AwaitedAck:
 
     expires_ms: int
     status: AckStatus | None = None
+    epoch: int = 0
+
+
+class Answer(NamedTuple):
+    """A decisive ack. ``epoch``: that of the device, if it rejected the command because of its epoch; otherwise 0."""
+
+    status: AckStatus
+    epoch: int = 0
+
+    @classmethod
+    def of(cls, ack: Ack) -> Self:
+        """The answer in an ack."""
+        return cls(ack.status, ack.reason.epoch if ack.reason is not None else 0)
 
 
 class Mailbox:
@@ -57,9 +71,9 @@ class Mailbox:
     async def put(
         self, device: Device, command: str, *, topic: str, payload: bytes, expires_ms: int, first: bool
     ) -> None:
-        """Store a command for the device's agent until ``expires_ms`` [ms since 1970]. Idempotent by command id.
+        """Store a command for the device's agent until ``expires_ms`` [ms since 1970], in place of one with this id.
 
-        A stored command is only replaced by one that expires later.
+        A stored command is not replaced by one that expires earlier.
 
         ``first``: returned before all others, as a Stop.
         """
@@ -69,12 +83,15 @@ class Mailbox:
         try:
             await self._tables.create(records.MAILBOX, Row(device.agent, key, records.to_data(entry)))
         except Conflict:
+            # A command that was rejected because of its epoch is issued again with another payload.
             await records.upsert(
                 self._tables,
                 records.MAILBOX,
                 device.agent,
                 key,
-                lambda existing: None if existing is not None and existing.expires_ms >= expires_ms else entry,
+                lambda existing: (
+                    None if existing is not None and (existing.expires_ms > expires_ms or existing == entry) else entry
+                ),
                 MailboxEntry,
             )
         self._notify(device.agent)
@@ -130,16 +147,17 @@ class Mailbox:
                 return
             awaited = records.read(row, AwaitedAck)
             if awaited.status is None or (ack.status.terminal and not awaited.status.terminal):
-                data = records.to_data(replace(awaited, status=ack.status))
+                status, epoch = Answer.of(ack)
+                data = records.to_data(replace(awaited, status=status, epoch=epoch))
                 await self._tables.replace(records.MAILBOX, row.changed(data))
 
         await records.retry(attempt)
         self._notify(agent)
 
-    async def stored_ack(self, agent: str, command: str) -> AckStatus | None:
+    async def stored_ack(self, agent: str, command: str) -> Answer | None:
         """The stored ack of a command."""
-        row = await self._tables.get(records.MAILBOX, agent, _ack_key(command))
-        return None if row is None else records.read(row, AwaitedAck).status
+        _, awaited = await records.find(self._tables, records.MAILBOX, agent, _ack_key(command), AwaitedAck)
+        return None if awaited is None or awaited.status is None else Answer(awaited.status, awaited.epoch)
 
     @contextlib.contextmanager
     def changes(self, agent: str) -> Iterator[asyncio.Event]:

@@ -247,6 +247,20 @@ def test_a_lease_from_before_a_restart_is_rejected(harness: DeviceHarness, make_
     again.done(grant(), epoch=5)
 
 
+def test_a_rejected_action_runs_once_when_the_cloud_issues_it_with_a_higher_epoch(harness: DeviceHarness) -> None:
+    harness.done(grant(), epoch=4)
+    reason = harness.failed(move(0.1), epoch=2, command_id="action")
+    assert (reason.code, reason.epoch) == ("stale_epoch", 4)
+    harness.command(move(0.1), epoch=5, command_id="action")
+    eventually(lambda: harness.acks("action")[-1].status is AckStatus.DONE)
+    count = len(harness.acks("action"))
+    for epoch in (2, 5, 6):
+        harness.command(move(0.3), epoch=epoch, command_id="action")
+    eventually(lambda: len(harness.acks("action")) == count + 3)
+    assert [ack.status for ack in harness.acks("action")[-3:]] == [AckStatus.DONE] * 3
+    assert [ack.status for ack in harness.acks("action")].count(AckStatus.STARTED) == 1
+
+
 def test_malformed_messages_are_counted_and_ignored(harness: DeviceHarness) -> None:
     harness.done(grant(), epoch=1)
     for kind in (topics.CTL, topics.STOP, topics.CMD):

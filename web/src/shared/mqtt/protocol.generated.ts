@@ -428,11 +428,16 @@ export interface Ack {
 /** Progress of a command. The last four values are terminal. */
 export type AckStatus = "accepted" | "cancelled" | "done" | "expired" | "failed" | "received" | "started";
 
-/** Why a command ended: a code for programs, and a message for people that names the remedy. */
+/**
+ * Why a command ended: a code for programs, and a message for people that names the remedy.
+ *
+ * `epoch`: highest epoch that the device has seen, if it rejected the command because of its epoch; otherwise 0.
+ */
 export interface Reason {
   /** no control and format characters */
   code: string;
   message: string;
+  epoch?: number;
 }
 
 /** Move to joint positions. `plan`: avoid obstacles. */

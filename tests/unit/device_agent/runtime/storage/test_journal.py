@@ -5,9 +5,10 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from device_agent.protocol import Ack, AckStatus, StopLatch
+from device_agent.protocol import Ack, AckStatus, Reason, StopLatch
 from device_agent.runtime.storage.journal import Journal, JournalError
 
 
@@ -45,6 +46,22 @@ def test_a_command_is_recorded_once_and_its_terminal_ack_is_final(journal: Journ
         stored = journal.begin("arm", ack("c1"))
         assert stored is not None
         assert stored.status is (AckStatus.DONE if status is AckStatus.FAILED else status)
+
+
+def test_a_command_rejected_because_of_its_epoch_is_new_again_with_a_higher_epoch(journal: Journal) -> None:
+    journal.begin("arm", ack("c1"), epoch=1)
+    rejected = msgspec.structs.replace(
+        ack("c1", AckStatus.FAILED, 2), reason=Reason(code="stale_epoch", message="", epoch=7)
+    )
+    journal.record(rejected)
+    for epoch in (1, 6, 7):
+        assert journal.begin("arm", ack("c1"), epoch=epoch) == rejected
+    assert journal.begin("arm", ack("c1"), epoch=8) is None
+    assert journal.undelivered("arm") == (ack("c1"),)
+    for status in (AckStatus.STARTED, AckStatus.DONE):
+        journal.record(ack("c1", status, 2))
+        for epoch in (1, 7, 8, 9):
+            assert journal.begin("arm", ack("c1"), epoch=epoch) == ack("c1", status, 2)
 
 
 def test_open_commands_of_a_previous_run_are_failed(open_journal: OpenJournal) -> None:

@@ -35,7 +35,7 @@ async def confirmed(wait_ms: int) -> bool:
     delivery = Delivery(bus=unused, mailbox=mailbox, relay=unused)
     signed = SignedCommand("aaaaaaaaaa-arm-00000000000000000000", b"{}", clock.now_ms() + 5_000)
     async with asyncio.timeout(20):
-        return await delivery.send_confirmed(ARM, signed, wait_ms=wait_ms)
+        return (await delivery.send_confirmed(ARM, signed, wait_ms=wait_ms)).confirmed
 
 
 def test_a_wait_ends_at_its_limit_during_a_concurrent_change() -> None:
