@@ -87,8 +87,12 @@ def adapters(settings: Settings, clock: Clock) -> Adapters:
         certificates=certificates(settings),
         password_hashes=Argon2Hashes(),
         catalogue=FolderCatalogue(settings.robots),
-        free_bytes=lambda: free_bytes(settings),
+        free_bytes=lambda: _least(free_bytes(settings), tables.left_bytes()),
     )
+
+
+def _least(*sizes: int | None) -> int | None:
+    return min((size for size in sizes if size is not None), default=None)
 
 
 def free_bytes(settings: Settings) -> int | None:
@@ -163,7 +167,8 @@ def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables,
         case None:
             from function_app.adapters.local.tables import SqliteTables  # noqa: PLC0415
 
-            return SqliteTables(settings.home / TABLES_FILE), _files(settings, signing)
+            max_bytes = settings.storage_limits.max_tables_mb * 1_000_000
+            return SqliteTables(settings.home / TABLES_FILE, max_bytes=max_bytes), _files(settings, signing)
 
 
 def access(

@@ -6,7 +6,7 @@ partition sort by their UTF-8 bytes. ``data`` is a JSON object of at most 256 KB
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 MAX_BATCH = 100
 """Maximum number of writes in a batch: the limit of Azure Tables and DynamoDB."""
@@ -19,12 +19,47 @@ SCHEMA = 1
 MAX_KEY_LENGTH = 512
 
 
+RELAXED: Final = frozenset(
+    {
+        "Attempts",
+        "Data",
+        "Descriptions",
+        "Diagnostics",
+        "Events",
+        "Faults",
+        "Forget",
+        "Latency",
+        "Mailbox",
+        "ModelChecks",
+        "Pending",
+        "Series",
+        "Uploads",
+        "Usage",
+        "Watched",
+        "Watchers",
+    }
+)
+"""Tables whose last writes may be lost when the machine loses power: measurements, and what is written again or before
+the row that needs it. A store keeps the order of writes: a later durable write makes them durable, too."""
+_RELAXED_KEYS: Final = {"Agents": ("link", "state:"), "Control": ("event:",)}
+"""Key prefixes of rows that agents report again after each connection, and of events whose deletion is repeated."""
+
+
+def is_durable(table: str, key: str) -> bool:
+    """Whether an acknowledged write of this row must survive a loss of power."""
+    return table not in RELAXED and not key.startswith(_RELAXED_KEYS.get(table, ()))
+
+
 class Conflict(Exception):  # noqa: N818 (an outcome that callers expect, not a fault)
     """The row exists already, does not exist, or has another ETag."""
 
 
 class StoreError(Exception):
     """The store is not available; the text says what to do."""
+
+
+class StoreFullError(StoreError):
+    """The store has reached its maximum size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +100,8 @@ class Write:
 
 class Tables(Protocol):
     """Stores rows. Every call is atomic, and reads see all earlier writes.
+
+    Acknowledged writes of durable rows (``is_durable``) survive a loss of power. Damaged rows are never returned.
 
     A retried ``create``, ``replace`` or ``delete`` raises ``Conflict`` if the first call succeeded. If the store is not
     reachable, every method raises ``StoreError``; the state of a failed write is unknown.
@@ -124,6 +161,15 @@ class Tables(Protocol):
             Conflict: One write does not match; nothing was written.
             ValueError: No writes, too many, over ``MAX_BATCH_BYTES``, two partitions, or a repeated key.
         """
+
+    async def check(self, *, thorough: bool = False) -> tuple[str, ...]:
+        """Known losses and damage of the stored data, each with its remedy; empty: none.
+
+        ``thorough`` reads everything that is stored on this machine. A cloud store checks its data itself: none.
+        """
+
+    def left_bytes(self) -> int | None:
+        """How many bytes the store may still grow; ``None``: it has no limit."""
 
     async def close(self) -> None:
         """Close all connections."""

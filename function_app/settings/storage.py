@@ -109,13 +109,16 @@ class StorageLimits:
         account_mb: Captures, scripts and robot types of an account.
         device_mb: Captures of a device.
         series_mb: Received measurements of a device in a day.
-        min_free_mb: Disk space that captures and measurements leave free, for stores on this machine.
+        min_free_mb: Disk space that captures and measurements leave free, for stores on this machine; also within
+            ``max_tables_mb``.
+        max_tables_mb: Maximum size of the tables on this machine.
     """
 
     account_mb: int = 20_000
     device_mb: int = 10_000
     series_mb: int = 10_000
     min_free_mb: int = 500
+    max_tables_mb: int = 100_000
 
 
 def read_store(env: Environment) -> AzureStore | AwsStore | None:
@@ -196,6 +199,7 @@ def read_storage_limits(env: Environment) -> StorageLimits:
         device_mb=env.number("TELESCOPE_MAX_DEVICE_MB", default.device_mb, 1, 1_000_000_000),
         series_mb=env.number("TELESCOPE_MAX_SERIES_MB", default.series_mb, 1, 1_000_000_000),
         min_free_mb=env.number("TELESCOPE_MIN_FREE_MB", default.min_free_mb, 0, 1_000_000_000),
+        max_tables_mb=env.number("TELESCOPE_MAX_TABLES_MB", default.max_tables_mb, 1, 1_000_000_000),
     )
 
 

@@ -86,6 +86,13 @@ class MemoryTables:
         for stored in [stored for stored in self._partitions if stored[0] == table]:
             del self._partitions[stored]
 
+    async def check(self, *, thorough: bool = False) -> tuple[str, ...]:
+        del thorough
+        return ()
+
+    def left_bytes(self) -> int | None:
+        return None
+
     async def close(self) -> None:
         """Nothing is open."""
 

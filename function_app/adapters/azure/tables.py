@@ -143,6 +143,13 @@ class AzureTables:
             for write, etag in zip(writes, etags, strict=True)
         )
 
+    async def check(self, *, thorough: bool = False) -> tuple[str, ...]:
+        del thorough
+        return ()
+
+    def left_bytes(self) -> int | None:
+        return None
+
     async def close(self) -> None:
         await self._client.close()
 

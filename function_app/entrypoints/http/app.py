@@ -49,7 +49,7 @@ from function_app.entrypoints.http.robot_types import (
 from function_app.entrypoints.http.sharing import routes as sharing
 from function_app.entrypoints.http.telemetry import blob_transfers, events, latency, series, uploads
 from function_app.ports.clock import Clock
-from function_app.ports.tables import StoreError
+from function_app.ports.tables import StoreError, StoreFullError
 from function_app.services.identity.rate_limiter import RateLimiter
 
 _SECURE_FOR = b"max-age=31536000"
@@ -162,6 +162,8 @@ async def _on_problem(_request: Request, error: Exception) -> Response:
 
 async def _on_store(_request: Request, error: Exception) -> Response:
     _log.error("%s", error)
+    if isinstance(error, StoreFullError):
+        return problem(Problem("storage-full", 507, "The store is full", "The tables are full. Ask the administrator."))
     return problem(
         store_unavailable("The tables are unavailable. The server's log contains the reason. Try again later.")
     )

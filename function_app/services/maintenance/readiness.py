@@ -10,11 +10,12 @@ from function_app.services.storage import records
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """``ok`` or an error text for each dependency."""
+    """``ok`` or an error text for each dependency. ``usable``: whether the tables can be used."""
 
     tables: str
     broker: str
     models: str = "ok"
+    usable: bool = True
 
 
 class ReadinessCheck:
@@ -29,10 +30,12 @@ class ReadinessCheck:
         try:
             await self.require_tables()
         except StoreError as error:
-            return Health(tables=str(error), broker=await self._bus.status())
+            return Health(tables=str(error), broker=await self._bus.status(), usable=False)
+        problems = await self._tables.check()
         refusal = await read_refusal(self._tables)
-        return Health(tables="ok", broker=await self._bus.status(), models=refusal or "ok")
+        tables = " ".join(problems) or "ok"
+        return Health(tables=tables, broker=await self._bus.status(), models=refusal or "ok")
 
     async def require_tables(self) -> None:
-        """Read a row."""
+        """Read a row, and check that the store is still the one that was opened."""
         await self._tables.get(records.ACCOUNTS, "health", "health")

@@ -18,13 +18,14 @@ def router(functions: Functions, _auth: RequestAuthenticator) -> Routes:
     async def health(_request: Request) -> Response:
         """503: the tables are not available.
 
-        ``degraded``: the broker is not reachable, and the server reconnects; or uploaded models are not checked.
+        ``degraded``: the broker is not reachable, and the server reconnects; or data of the tables were lost or are
+        damaged; or uploaded models are not checked.
         """
         result = await functions.health.check()
-        if result.tables != "ok":
+        if not result.usable:
             raise store_unavailable(result.tables)
         body = schemas.HealthOut(
-            status="ok" if result.broker == result.models == "ok" else "degraded",
+            status="ok" if result.tables == result.broker == result.models == "ok" else "degraded",
             version=VERSION,
             tables=result.tables,
             broker=result.broker,
