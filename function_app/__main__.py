@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from device_agent.protocol.security import private_folder
-from function_app.entrypoints.cli import accounts, audit, keys, server
+from function_app.entrypoints.cli import accounts, audit, backup, keys, server
 from function_app.entrypoints.hosts.port_taken import PortTaken
 from function_app.ports.model_compiler import CompilerMissingError
 from function_app.ports.tables import StoreError
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     parser = argparse.ArgumentParser(prog="telescope-server", description="The Telescope server.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in (server, keys, accounts, audit):
+    for module in (server, keys, accounts, audit, backup):
         module.add_commands(commands)
     os.umask(private_folder.UMASK)
     options = parser.parse_args(arguments)

@@ -4,6 +4,7 @@ from functools import cached_property
 
 from function_app.bootstrap.accounts import AccountServices
 from function_app.services.maintenance.readiness import ReadinessCheck
+from function_app.services.maintenance.restored_backup import RestoredBackup
 from function_app.services.maintenance.scheduler import Scheduler
 from function_app.services.robot_types.cleanup import RobotTypeCleanup
 from function_app.services.storage.retention import DAY_MS
@@ -34,6 +35,18 @@ class MaintenanceServices(AccountServices):
             uploads=self.uploads,
             robot_types=RobotTypeCleanup(tables=self.tables, blobs=self.blobs, clock=self.clock),
             keep_actions_ms=self.settings.retention.actions_days * DAY_MS,
+            clock=self.clock,
+        )
+
+    @cached_property
+    def restored_backup(self) -> RestoredBackup:
+        return RestoredBackup(
+            tables=self.tables,
+            action_store=self.action_store,
+            queues=self.queues,
+            reminders=self.reminders,
+            audit_log=self.audit_log,
+            audit_reader=self.audit_reader,
             clock=self.clock,
         )
 

@@ -210,7 +210,7 @@ class Robot:
 
     def _rejected_before(self, command: Command) -> bool:
         """Whether a rejected command was sent again with an epoch that the device has not seen."""
-        if self.gate is None or command.epoch <= self.gate.epoch:
+        if self.gate is None or command.epoch <= self.gate.epoch or command.id not in self._last_acks:
             return False
         reason = codec.decode(self._last_acks[command.id], Ack).reason
         return reason is not None and reason.epoch > 0

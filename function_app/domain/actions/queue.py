@@ -21,6 +21,7 @@ REMOVED = "removed"
 UNSHARED = "unshared"
 KEY_ENDED = "api-key-ended"
 SIGNED_OUT = "signed-out"
+RESTORED = "restored"
 DROPPED: Final = {
     FAILED_BEFORE: (
         Status.CANCELLED,
@@ -41,6 +42,10 @@ DROPPED: Final = {
     KEY_ENDED: (
         Status.FAILED,
         "The API key that started it was revoked, has expired, or may not operate this device. Create a new key.",
+    ),
+    RESTORED: (
+        Status.CANCELLED,
+        "It was queued in a restored backup; it may have run since. Check the device before starting it again.",
     ),
     SIGNED_OUT: (Status.FAILED, "The session that started it has signed out. Start it again."),
 }

@@ -55,6 +55,7 @@ class AccountEvent(StrEnum):
     MOVEMENT_DELETED = "movement-deleted"
     ROBOT_TYPE_UPLOADED = "robot-type-uploaded"
     ROBOT_TYPE_DELETED = "robot-type-deleted"
+    RESTORED = "restored"
 
 
 @dataclass(frozen=True, slots=True)

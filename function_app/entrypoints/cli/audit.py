@@ -50,9 +50,11 @@ async def _verify(functions: Functions, options: argparse.Namespace) -> int:
     heads = tuple(head for head in expected if isinstance(head, Head))
     for chain in await _chains(functions, options.account):
         verdict = await functions.audit_reader.verify(chain, expected=heads)
-        result = f"BROKEN {chain} {verdict.broken}" if verdict.broken else f"OK {chain} {verdict.head}"
+        result = f"OK {chain} {verdict.head}"
+        if verdict.broken or verdict.missing:
+            result = f"BROKEN {chain} {verdict.broken}" if verdict.broken else f"MISSING {chain} {verdict.missing}"
+            broken = True
         print(f"{result} ({verdict.anchors} heads in the blob store)")
-        broken = broken or bool(verdict.broken)
     return _EXIT_BROKEN if broken else 0
 
 

@@ -2,11 +2,15 @@
 
 import argparse
 import asyncio
+import contextlib
+import logging
 import os
+from collections.abc import Iterator
 from typing import Any
 
 from function_app import settings
 from function_app.adapters import factory
+from function_app.adapters.local.installation import lock
 from function_app.bootstrap import Functions
 from function_app.entrypoints.cli import build, with_functions
 from function_app.entrypoints.hosts import worker
@@ -14,6 +18,8 @@ from function_app.settings import SettingsError
 
 _WORKER_NICE = 5
 """HTTP responses, and an agent on the same machine, have priority over storage."""
+
+_log = logging.getLogger(__name__)
 
 
 def add_commands(commands: Any) -> None:
@@ -35,14 +41,30 @@ def _serve(_: argparse.Namespace) -> int:
     from function_app.entrypoints.hosts import uvicorn  # noqa: PLC0415 (cloud packages do not contain it)
 
     functions = build()
-    asyncio.run(_check(functions))
-    uvicorn.serve(functions)
+    with _using(functions):
+        asyncio.run(_check(functions))
+        uvicorn.serve(functions)
     return 0
+
+
+@contextlib.contextmanager
+def _using(functions: Functions) -> Iterator[None]:
+    """Prevent that a backup is restored while this program runs."""
+    if functions.settings.store is not None:
+        yield
+        return
+    try:
+        with lock.in_use(functions.settings.home):
+            yield
+    except lock.InUse as error:
+        raise SettingsError(f"a backup is being restored to {error}; start again afterwards") from error
 
 
 async def _check(functions: Functions) -> None:
     """Report unavailable tables or keys at the start instead of at the first request."""
     await functions.health.require_tables()
+    for problem in await functions.tables.check(thorough=True):
+        _log.error("%s", problem)
     await functions.keys.current()
     await functions.tables.close()
 
@@ -55,14 +77,16 @@ def _prepare(_: argparse.Namespace) -> int:
 async def _work(functions: Functions, _: argparse.Namespace) -> None:
     if hasattr(os, "nice"):
         os.nice(_WORKER_NICE)
-    await worker.work(functions)
+    with _using(functions):
+        await worker.work(functions)
 
 
 async def _xmpp(functions: Functions, _: argparse.Namespace) -> None:
     try:
         from function_app.entrypoints.xmpp import run_gateway  # noqa: PLC0415 (slixmpp is optional)
 
-        await run_gateway(functions)
+        with _using(functions):
+            await run_gateway(functions)
     except ModuleNotFoundError as error:
         raise SettingsError(f"the XMPP gateway needs the Python package {error.name}; run `make env`") from error
 

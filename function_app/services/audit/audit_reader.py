@@ -12,6 +12,7 @@ from cryptography.exceptions import InvalidSignature
 from function_app.domain.audit import hash_chain as rules
 from function_app.domain.audit.hash_chain import FIRST, Head
 from function_app.domain.common.problems import forbidden, invalid_cursor
+from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.blobs import Blobs
 from function_app.ports.signing_keys import SigningKeys
@@ -48,12 +49,18 @@ class AuditFilter:
 
 @dataclass(frozen=True, slots=True)
 class VerificationResult:
-    """The state of one chain. ``broken`` describes the first invalid place; empty: the chain is intact."""
+    """The state of one chain.
+
+    Attributes:
+        broken: The first invalid place; empty: the chain is intact.
+        missing: Which records are missing because a backup was restored, as the chain itself records.
+    """
 
     chain: str
     head: Head
     broken: str = ""
     anchors: int = 0
+    missing: str = ""
 
 
 class AuditReader:
@@ -115,6 +122,30 @@ class AuditReader:
         anchored = await self._anchors(chain)
         if isinstance(anchored, str):
             return VerificationResult(chain, rules.genesis(chain), anchored)
+        result = await self._verify(chain, anchored, expected)
+        restored = await self._last_restore(chain) if result.broken else None
+        if restored is None:
+            return result
+        # Records from the restore on have other hashes than the lost ones of the same numbers.
+        seq = int(restored.key.rpartition(":")[2])
+        before = [tuple(head for head in heads if head.seq < seq) for heads in (anchored, expected)]
+        if (await self._verify(chain, *before)).broken:
+            return result
+        missing = (
+            f"the tables were restored at record {seq} from a backup of {rfc3339(restored.data['data']['backup_ms'])}; "
+            f"records that were written between that time and {rfc3339(restored.data['at_ms'])} are missing"
+        )
+        return VerificationResult(chain, await self.head(chain) or result.head, "", result.anchors, missing)
+
+    async def _last_restore(self, chain: str) -> Row | None:
+        """The newest record of a restored backup."""
+        restored = None
+        async for row in records.all_rows(self._tables, records.AUDIT, chain, first=record_key(0), last="record;"):
+            if row.data.get("event") == rules.AccountEvent.RESTORED:
+                restored = row
+        return restored
+
+    async def _verify(self, chain: str, anchored: tuple[Head, ...], expected: tuple[Head, ...]) -> VerificationResult:
         existing = {head.seq: head for head in anchored} | {head.seq: head for head in expected}
         for head in (*anchored, *expected):
             if existing[head.seq] != head:

@@ -26,6 +26,7 @@ from function_app.services.audit.audit_log import AuditLog
 from function_app.services.control import control_events as control_events_
 from function_app.services.control.control_events import ControlEvents
 from function_app.services.health.reported_faults import ReportedFaults
+from function_app.services.maintenance.restored_backup import RESEND, RESEND_MS
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.pairing.offboarding import Offboarding, offboarding_of
 from function_app.services.robot_types.cleanup import RobotTypeCleanup
@@ -105,6 +106,7 @@ class Scheduler:
             control_events_.REMINDER: control_events.check,
             audit_log_.REMINDER: audit_log.check,
             audit_log_.ANCHOR_REMINDER: audit_log.anchor,
+            RESEND: self._resend,
         }
 
     async def run_due_jobs(self, *, current: bool = True) -> None:
@@ -187,6 +189,14 @@ class Scheduler:
         if verdict is NextStep.DOUBT:
             return await self._end(result, Status.UNKNOWN, "no-report", NO_REPORT, now_ms)
         return await self._end(result, Status.EXPIRED, "queue-timeout", TIMEOUT, now_ms)
+
+    async def _resend(self, action_id: str) -> None:
+        """Send the command of an open action again after a restore; the device repeats its last ack."""
+        result = await self._action_store.get(action_id)
+        if result is None or result.action.status.terminal:
+            return
+        await self._reminders.schedule(f"{RESEND}:{action_id}", self._clock.now_ms() + RESEND_MS)
+        await self._publish(result, self._clock.now_ms())
 
     async def _check_queue(self, device: str, note: Row) -> None:
         """Advance a queue after its process may have been killed."""

@@ -185,6 +185,7 @@ export const texts = {
       "movement-deleted": "Movement deleted",
       "robot-type-uploaded": "Robot type added",
       "robot-type-deleted": "Robot type deleted",
+      restored: "Backup restored",
       "control-taken": "Control taken",
       "control-taken-over": "Control taken over",
       "control-handed-over": "Control handed over",

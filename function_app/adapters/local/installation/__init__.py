@@ -1,0 +1,1 @@
+"""The folder of an installation: its lock, and archives of its content."""

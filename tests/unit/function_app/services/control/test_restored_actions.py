@@ -1,0 +1,107 @@
+"""Actions that were in progress when a backup was made end truthfully after it was restored."""
+
+import pytest
+
+from device_agent.protocol import AckStatus, Command
+from function_app.domain.audit.hash_chain import Head
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person
+from tests.unit.function_app.services.actions.queue_requests import pass_time, queued, sent
+from tests.unit.function_app.services.control.test_restored_tables import Backup, Restore, backup, gate
+
+__all__ = ["backup", "gate"]
+
+
+def settle(cloud: Cloud, restore: Restore) -> int:
+    """Restore the tables, as the command does before the server starts."""
+    created_ms = cloud.clock.now_ms()
+    restore()
+    count = cloud.run(cloud.functions.restored_backup.settle(created_ms=created_ms))
+    cloud.sweep()
+    return count
+
+
+def running(command: Command) -> tuple[AckStatus, ...]:
+    del command
+    return AckStatus.RECEIVED, AckStatus.ACCEPTED, AckStatus.STARTED
+
+
+@pytest.mark.parametrize("acked", [(), (AckStatus.RECEIVED,), (AckStatus.RECEIVED, AckStatus.STARTED)], ids=str)
+def test_an_action_that_ended_after_the_backup_is_done(
+    cloud: Cloud, anna: Person, robot: Robot, backup: Backup, acked: tuple[AckStatus, ...]
+) -> None:
+    robot.reports = lambda _: acked
+    action = anna.start(robot.device).json()["id"]
+    restore = backup()
+    done = robot.report(action, AckStatus.DONE)
+    robot._last_acks[action] = b'{"id":"%s","status":"done","sequence":%d,"at_ms":1,"tick_ms":1}' % (
+        action.encode(),
+        done.sequence,
+    )
+    assert anna.action(action)["status"] == "done"
+    pass_time(cloud, 20)
+    assert settle(cloud, restore) == 1
+    assert anna.action(action)["status"] == "done"
+    assert len(sent(robot)) == 1, "it did not run again"
+    robot.reports = running
+    assert anna.start(robot.device, wait_ms=20_000, wait_for="started").status_code == 200
+
+
+def test_an_action_that_the_device_does_not_know_expires_and_does_not_block(
+    cloud: Cloud, anna: Person, robot: Robot, backup: Backup
+) -> None:
+    robot.silent = True
+    action = anna.start(robot.device, timeout_ms=1_000).json()["id"]
+    restore = backup()
+    assert settle(cloud, restore) == 1
+    pass_time(cloud, 62)
+    shown = anna.action(action)
+    assert (shown["status"], shown["reason"]["code"]) == ("failed", "lost")
+    robot.silent = False
+    assert anna.start(robot.device, wait_ms=20_000, wait_for="started").status_code == 200
+
+
+def test_queued_actions_of_a_backup_do_not_start(cloud: Cloud, anna: Person, robot: Robot, backup: Backup) -> None:
+    robot.reports = running
+    first = anna.start(robot.device).json()["id"]
+    waiting = [queued(anna, robot.device) for _ in range(2)]
+    restore = backup()
+    robot.report(first, AckStatus.DONE)
+    for action in waiting:
+        robot.report(action, AckStatus.DONE)
+    before = sent(robot)
+    robot._last_acks[first] = robot._last_acks[waiting[-1]].replace(waiting[-1].encode(), first.encode())
+    assert settle(cloud, restore) == 3
+    for action in waiting:
+        shown = anna.action(action)
+        assert (shown["status"], shown["reason"]["code"]) == ("cancelled", "restored")
+    assert sent(robot) == before
+
+
+def test_the_audit_log_names_the_restore_and_reports_missing_records(
+    cloud: Cloud, anna: Person, robot: Robot, backup: Backup
+) -> None:
+    del robot
+    reader = cloud.functions.audit_reader
+    restore = backup()
+
+    def head() -> Head:
+        found = cloud.run(reader.head(anna.account))
+        assert found is not None
+        return found
+
+    old = head()
+    for number in range(3):
+        anna.post("/api-keys", {"name": f"key {number}", "role": "viewer", "days": 1})
+    lost = head()
+    assert lost.seq > old.seq
+    settle(cloud, restore)
+    assert cloud.run(reader.verify(anna.account)).broken == ""
+    for number in range(5):
+        anna.post("/api-keys", {"name": f"other {number}", "role": "viewer", "days": 1})
+    result = cloud.run(reader.verify(anna.account, expected=(old, lost)))
+    assert result.broken == ""
+    assert f"restored at record {old.seq + 1}" in result.missing
+    assert "are missing" in result.missing
+    tampered = Head(old.seq, "0" * 64)
+    assert "differs from the anchor" in cloud.run(reader.verify(anna.account, expected=(tampered, lost))).broken
