@@ -18,6 +18,7 @@ from function_app.adapters.local.device_feed import MqttDeviceFeed, MqttTelemetr
 from function_app.adapters.local.password_hasher import Argon2Hashes
 from function_app.adapters.local.robot_catalogue import FolderCatalogue
 from function_app.adapters.local.signing_keys import FileKeys
+from function_app.adapters.local.table_file import FILE_NAME
 from function_app.adapters.mqtt.connection import Broker
 from function_app.adapters.mqtt.tls import client_context
 from function_app.adapters.shared.key_ring_keys import RingKeys
@@ -34,7 +35,6 @@ from function_app.ports.robot_catalogue import RobotCatalogue
 from function_app.ports.tables import StoreError, Tables
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, KeyVault, SecretsManager, Settings
 
-TABLES_FILE = "tables.sqlite"
 BLOBS_PATH = "/api/v1/blobs"
 """Path of presigned URLs of ``FileBlobs``."""
 MOSQUITTO_SERVICE = "service"
@@ -168,7 +168,7 @@ def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables,
             from function_app.adapters.local.tables import SqliteTables  # noqa: PLC0415
 
             max_bytes = settings.storage_limits.max_tables_mb * 1_000_000
-            return SqliteTables(settings.home / TABLES_FILE, max_bytes=max_bytes), _files(settings, signing)
+            return SqliteTables(settings.home / FILE_NAME, max_bytes=max_bytes), _files(settings, signing)
 
 
 def access(

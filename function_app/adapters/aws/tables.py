@@ -8,6 +8,9 @@ An item has the attributes
 - ``name``: the full key if ``k`` is truncated
 - ``etag``: random, new with each write
 - ``data``: the JSON as text, because DynamoDB numbers differ from JSON numbers
+
+A write is acknowledged after it is stored on disks in at least two availability zones; DynamoDB checks and repairs its
+replicas.
 """
 
 import asyncio

@@ -7,7 +7,8 @@ properties, an entity has
 - ``Write``: random, new with each write, to identify a write whose response was lost
 - ``Name``: the code of the full key if ``RowKey`` is truncated (``names``)
 
-The ETag is Azure's. Batches are entity group transactions.
+The ETag is Azure's. Batches are entity group transactions. A write is acknowledged after it is stored on three replicas
+of the storage account's region; Azure checks and repairs them.
 """
 
 import contextlib

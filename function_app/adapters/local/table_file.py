@@ -19,6 +19,8 @@ from typing import Any, Final, NamedTuple
 
 from function_app.ports.tables import StoreError
 
+FILE_NAME: Final = "tables.sqlite"
+"""Name of the file in an installation's folder."""
 _NONCE_LENGTH: Final = 16
 _ETAG_LENGTH: Final = 24
 _WAL_HEADER: Final = struct.Struct(">8I")

@@ -11,6 +11,7 @@ from typing import Any
 from function_app import settings
 from function_app.adapters import factory
 from function_app.adapters.local.installation import lock
+from function_app.adapters.local.table_file import FILE_NAME
 from function_app.bootstrap import Functions
 from function_app.entrypoints.cli import build, with_functions
 from function_app.entrypoints.hosts import worker
@@ -19,6 +20,8 @@ from function_app.settings import SettingsError
 _WORKER_NICE = 5
 """HTTP responses, and an agent on the same machine, have priority over storage."""
 
+_MAX_CHECKED_BYTES = 500_000_000
+"""Size of the tables up to which all rows are checked before the start, which takes about six seconds."""
 _log = logging.getLogger(__name__)
 
 
@@ -63,7 +66,11 @@ def _using(functions: Functions) -> Iterator[None]:
 async def _check(functions: Functions) -> None:
     """Report unavailable tables or keys at the start instead of at the first request."""
     await functions.health.require_tables()
-    for problem in await functions.tables.check(thorough=True):
+    tables = functions.settings.home / FILE_NAME
+    thorough = functions.settings.store is None and tables.stat().st_size <= _MAX_CHECKED_BYTES
+    if functions.settings.store is None and not thorough:
+        _log.warning("%s is too large for a check at each start; run `telescope-server verify`", tables)
+    for problem in await functions.tables.check(thorough=thorough):
         _log.error("%s", problem)
     await functions.keys.current()
     await functions.tables.close()

@@ -18,8 +18,10 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
+from function_app.adapters.local.table_file import FILE_NAME
+
 MANIFEST: Final = "manifest.json"
-TABLES: Final = "tables.sqlite"
+TABLES: Final = FILE_NAME
 FORMAT: Final = 1
 _AUDIT: Final = "blobs/audit"
 _OTHER_PROGRAMS: Final = ("agents", "logs")
