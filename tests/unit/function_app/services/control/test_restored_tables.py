@@ -186,6 +186,15 @@ class TestRestoredLease:
         assert len(robot.received(MoveJoints)) == 1
 
 
+def test_a_lease_that_the_device_has_ended_is_not_replaced(anna: Person, robot: Robot, gate: LeaseGate) -> None:
+    """After a hold, the operator must take control again; that is not a restored backup."""
+    anna.take_lease(robot.device)
+    gate.burn()
+    answer = anna.start(robot.device, wait_ms=20_000, wait_for="done").json()
+    assert (answer["status"], answer["reason"]["code"]) == ("failed", "lease_ended")
+    assert len(robot.received(MoveJoints)) == 1
+
+
 class TestForgery:
     """A hostile broker forges states and rejections."""
 
