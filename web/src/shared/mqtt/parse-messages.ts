@@ -215,7 +215,7 @@ const ack = object<Required<Ack>>({
   sequence: count,
   at_ms: count,
   tick_ms: count,
-  reason: nullable(object<Reason>({ code: text, message: text })),
+  reason: nullable(object<Reason>({ code: text, message: text, epoch: optional(count, 0) })),
   progress: nullable(number),
   output: optional(text, ""),
   result: optional(record, {}),
