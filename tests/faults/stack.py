@@ -116,7 +116,7 @@ class Stack:
         self.broker = self._child("broker", MODULES[self._kind], *ports, *(keys if self._kind == "amqtt" else folder))
         self.broker.wait_for_line("ready", PATIENCE_S)
         self.functions = self._child("functions", "function_app", "serve")
-        self.worker = self._child("worker", "function_app", "work")
+        self.worker = self.start_worker("worker")
         self.api = f"http://{HOST}:{self.port}/api/v1"
         self.http = self._closing.enter_context(httpx.Client(base_url=self.api, timeout=15))
         self.await_health()
