@@ -302,6 +302,9 @@ class Setpoint(Struct, frozen=True, kw_only=True):
         echo_tick_ms: ``tick_ms`` of the newest telemetry that the operator has received. Its age on the robot's own
             clock is the loop age.
         sent_ms: Time of sending on any clock of the operator [ms]; telemetry echoes it.
+        input: Number of the operator's input in this lease, from 1: each press of a pointer, key or gamepad starts a
+            new one. After a watchdog hold the device accepts only a higher number. 0: not numbered; a watchdog hold
+            then ends the lease.
     """
 
     epoch: Count
@@ -309,6 +312,7 @@ class Setpoint(Struct, frozen=True, kw_only=True):
     echo_tick_ms: Milliseconds
     sent_ms: float
     target: JointTarget | JogTarget | DriveTarget
+    input: Count = 0
 
 
 class Stop(Struct, frozen=True, kw_only=True):

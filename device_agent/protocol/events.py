@@ -45,7 +45,7 @@ class EventKind(StrEnum):
     STOP_RESET = "stop-reset"
     """The Stop latch was reset. ``caller``."""
     MOTION_HELD = "motion-held"
-    """Motion was brought to a hold. ``code``, ``epoch``."""
+    """Motion was brought to a hold. ``code``, ``epoch``. After ``watchdog``, a new input resumes."""
     ACTION_LOST = "action-lost"
     """A running action lost control of the device. ``code``, ``epoch``."""
     SPEECH_STARTED = "speech-started"

@@ -15,6 +15,7 @@ class JointTelemetry(Struct, frozen=True, kw_only=True):
         epoch: Epoch of the lease in force at the device, 0 for none. A holder that reads 0 has lost control.
         setpoint_sequence: Newest setpoint that the control loop has accepted; 0 for none in this lease.
         setpoint_sent_ms: ``sent_ms`` of that setpoint, so that the operator measures its round trip on one clock.
+        ended_input: Highest ``input`` of this lease whose setpoints the device no longer accepts; 0 for none.
         limited: Limits that changed a setpoint before it reached the motors.
     """
 
@@ -31,6 +32,7 @@ class JointTelemetry(Struct, frozen=True, kw_only=True):
     setpoint_sequence: Count = 0
     setpoint_sent_ms: float = 0.0
     loop_age_ms: float = 0.0
+    ended_input: Count = 0
     limited: tuple[Label, ...] = ()
 
 

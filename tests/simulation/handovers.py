@@ -1,9 +1,9 @@
 """Simulated handovers of control over an unreliable network, reproducible from one seed.
 
 The robot is the real controller with the real lease gate. Cloud, operators and network are simulated: grants, renewals,
-releases and setpoints are lost, duplicated, delayed and reordered. Operators continue after they have lost control. Old
-grants are replayed. The robot restarts with the content of its journal. A model that receives every message, but is
-independent of the gate's rules, checks the result.
+releases and setpoints are lost, duplicated, delayed and reordered. Operators continue after they have lost control, and
+after gaps, with the same input or a new one. Old grants are replayed. The robot restarts with the content of its
+journal. A model that receives every message, but is independent of the gate's rules, checks the result.
 """
 
 import heapq
@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 from device_agent.protocol import JointTarget, Mode, Setpoint, StopLatch
 from device_agent.protocol.security.setpoints import SetpointKeys
@@ -23,6 +24,11 @@ from tests.fakes.drivers import PERIOD_S, joint, robot_type
 HANDOVERS = 50
 """Handovers in one history of one robot."""
 _TYPE = robot_type(joints=[joint("elbow")])
+_WATCHDOG_S = 0.3
+_RAMP_PERIODS = 6
+"""Periods after an accepted setpoint, in which the joint becomes faster than ``_MOVING_RAD_S``."""
+_MOVING_RAD_S = 0.03
+"""Faster than this, the watchdog holds the joint when setpoints end."""
 
 
 @dataclass(order=True, slots=True)
@@ -35,6 +41,7 @@ class Message:
     epoch: int = field(compare=False)
     lease_s: float = field(compare=False, default=0.0)
     sequence: int = field(compare=False, default=0)
+    input: int = field(compare=False, default=0)
 
 
 @dataclass(slots=True)
@@ -69,8 +76,36 @@ class EpochModel:
         return needs_lease and self.expires_s.get(epoch, -1.0) < now_s
 
 
+@dataclass(slots=True)
+class InputModel:
+    """Decides from the accepted setpoints and the motion which inputs have ended."""
+
+    epoch: int = 0
+    newest: int = 0
+    accepted_s: float = 0.0
+    moving: bool = False
+    held: bool = False
+
+    def accepted(self, message: Message, now_s: float, tally: "Tally") -> bool:
+        """Record an accepted setpoint. Returns whether its input had ended."""
+        if message.epoch != self.epoch:
+            self.epoch, self.newest, self.held = message.epoch, 0, False
+        elif self.moving and now_s > self.accepted_s + _WATCHDOG_S + PERIOD_S:
+            self.held = True
+        stale = message.input < self.newest or (self.held and message.input == self.newest)
+        if message.input > self.newest:
+            tally["resumed"] += self.held
+            self.newest, self.held = message.input, False
+        self.accepted_s = now_s
+        return stale
+
+
 Tally = Counter[str]
-"""Counts of a run: ``handovers``, messages ``delivered``, commands ``applied``, and ``stale`` commands among them."""
+"""Counts of a run.
+
+``handovers``, messages ``delivered``, commands ``applied``, and ``stale`` commands among them; setpoints that
+``resumed`` motion by a new input after a hold, and rejected setpoints of an input that had ``ended``.
+"""
 
 
 class History:
@@ -90,6 +125,8 @@ class History:
         self._latch: StopLatch | None = None
         self._robot = self._create_controller()
         self._model = EpochModel()
+        self._inputs = InputModel()
+        self._now_s = 0.0
         self._queue: list[Message] = []
         self._number = 0
         self.tally: Tally = Counter()
@@ -99,7 +136,8 @@ class History:
         self._plan(handovers)
         while self._queue:
             message = heapq.heappop(self._queue)
-            self._robot.update(message.arrives_s)
+            message.arrives_s = self._now_s = max(message.arrives_s, self._now_s)
+            self._robot.update(self._now_s)
             self.tally["delivered"] += 1
             getattr(self, f"_{message.kind}")(message)
         return self.tally
@@ -115,12 +153,10 @@ class History:
             if rng.random() < 0.2:
                 self._send("reset", now_s - 0.05, epoch - 1)
             lease_s = rng.uniform(0.3, 2.0)
-            self._send("grant", now_s, epoch, lease_s)
+            self._send("grant", now_s, epoch, lease_s=lease_s)
             if rng.random() < 0.5:
-                self._send("grant", now_s + lease_s * 0.6, epoch, lease_s)
-            # A former holder may continue for a while.
-            for sequence in range(1, 5):
-                self._send("setpoint", now_s + rng.uniform(0.0, 2.5), epoch, sequence=sequence)
+                self._send("grant", now_s + lease_s * 0.6, epoch, lease_s=lease_s)
+            self._plan_setpoints(now_s, epoch)
             event = rng.random()
             if event < 0.3:
                 self._send("release", now_s + rng.uniform(0.1, 1.5), epoch)
@@ -132,18 +168,26 @@ class History:
                 self._send("stop", now_s + rng.uniform(0.0, 2.0), epoch)
             now_s += rng.uniform(0.05, 1.5)
 
-    def _send(self, kind: str, now_s: float, epoch: int, lease_s: float = 0.0, sequence: int = 0) -> None:
+    def _plan_setpoints(self, now_s: float, epoch: int) -> None:
+        """Setpoints with gaps; a former holder may continue for a while. Some operators number no inputs."""
+        rng = self._random
+        numbered, number = rng.random() < 0.8, 1
+        for sequence, sent_s in enumerate(sorted(now_s + rng.uniform(0.0, 2.5) for _ in range(4)), 1):
+            number += rng.random() < 0.4
+            self._send("setpoint", sent_s, epoch, sequence=sequence, input=number * numbered)
+
+    def _send(self, kind: str, now_s: float, epoch: int, **fields: Any) -> None:
         rng = self._random
         if rng.random() < 0.1:
             return  # lost
         for _ in range(2 if rng.random() < 0.1 else 1):
             delay = rng.random()
             max_delay_s = 0.05 if delay < 0.8 else 1.0 if delay < 0.97 else 20.0
-            self._put(kind, now_s + rng.random() * max_delay_s, epoch, lease_s, sequence)
+            self._put(kind, now_s + rng.random() * max_delay_s, epoch, **fields)
 
-    def _put(self, kind: str, arrives_s: float, epoch: int, lease_s: float = 0.0, sequence: int = 0) -> None:
+    def _put(self, kind: str, arrives_s: float, epoch: int, **fields: Any) -> None:
         self._number += 1
-        heapq.heappush(self._queue, Message(arrives_s, self._number, kind, epoch, lease_s, sequence))
+        heapq.heappush(self._queue, Message(arrives_s, self._number, kind, epoch, **fields))
 
     # ------------------------------------------------------------ the robot
 
@@ -195,14 +239,27 @@ class History:
             sequence=message.sequence,
             echo_tick_ms=tick_ms,
             sent_ms=0.0,
+            input=message.input,
             target=JointTarget(position_rad={"elbow": 1.0 if message.epoch % 2 else -1.0}),
         )
         try:
             self._robot.accept_setpoint(setpoint, now_s=now_s, tick_ms=tick_ms)
-        except Refused:
+        except Refused as refused:
+            self.tally["ended"] += refused.code == "input_ended"
             return
-        if self._robot.update(now_s).mode is Mode.STREAMING:
-            self._count(stale=self._model.stale(message.epoch, now_s, needs_lease=True))
+        if self._robot.update(now_s).mode is not Mode.STREAMING:
+            return
+        ended = self._inputs.accepted(message, now_s, self.tally)
+        self._count(stale=ended or self._model.stale(message.epoch, now_s, needs_lease=True))
+        self._ramp()
+
+    def _ramp(self) -> None:
+        """Run some periods, and record whether the joint moves at the end."""
+        before = self._robot.commanded_rad[0]
+        for _ in range(_RAMP_PERIODS):
+            self._now_s += PERIOD_S
+            before, (position,) = self._robot.commanded_rad[0], self._robot.update(self._now_s).position_rad
+        self._inputs.moving = abs(position - before) / PERIOD_S > _MOVING_RAD_S
 
     def _stop(self, _message: Message) -> None:
         self._model.all_ended()
@@ -266,6 +323,17 @@ class NoCheck(LeaseGate):
     def expire(self, now_s: float) -> bool:  # noqa: ARG002
         """Never expire."""
         return False
+
+
+class NoInputs(LeaseGate):
+    """A gate that keeps the lease after a hold and accepts every input."""
+
+    def check_input(self, number: int) -> None:
+        """Accept every input."""
+
+    def end_input(self) -> bool:
+        """End no input."""
+        return True
 
 
 class ExpiryOnly(LeaseGate):

@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 import pytest
 
 from device_agent.runtime.authority.lease_gate import LeaseGate
-from tests.simulation.handovers import HANDOVERS, ExpiryOnly, NoCheck, Tally, simulate
+from tests.simulation.handovers import HANDOVERS, ExpiryOnly, NoCheck, NoInputs, Tally, simulate
 
 FULL_SIZE = 1_000_000
 SAMPLE_SIZE = 50_000
@@ -17,9 +17,11 @@ def test_no_stale_command_is_applied() -> None:
     tally = simulate(SAMPLE_SIZE)
     assert tally["stale"] == 0
     assert tally["applied"] > SAMPLE_SIZE / 4, "most handovers must lead to applied commands"
+    assert tally["resumed"] > SAMPLE_SIZE / 100, "many gaps must end with a new input"
+    assert tally["ended"] > SAMPLE_SIZE / 100, "many operators must continue a held input"
 
 
-@pytest.mark.parametrize("mutant", [NoCheck, ExpiryOnly])
+@pytest.mark.parametrize("mutant", [NoCheck, ExpiryOnly, NoInputs])
 def test_a_gate_without_fencing_is_detected(mutant: type[LeaseGate]) -> None:
     assert simulate(SAMPLE_SIZE // 20, gate=mutant)["stale"] > 10
 

@@ -62,9 +62,15 @@ class Authority:
         return self._gate.epoch, self._gate.burned
 
     @property
-    def burned(self) -> bool:
-        """Whether the newest epoch is burned."""
-        return self._gate.burned >= self._gate.epoch
+    def ended_input(self) -> int:
+        """Highest input of the newest epoch that the device no longer accepts."""
+        return self._gate.ended_input
+
+    @property
+    def ended(self) -> bool:
+        """Whether the newest epoch is burned, or its newest input has ended."""
+        gate = self._gate
+        return gate.burned >= gate.epoch or 0 < gate.input == gate.ended_input
 
     def lease(self, now_s: float) -> Lease | None:
         """The lease in force."""
@@ -76,7 +82,7 @@ class Authority:
         """See ``Controller.grant``. Returns True if the epoch is new and the previous holder lost control."""
         before, previous = self._gate.epoch, self._gate.granted
         self._gate.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason, keys=keys)
-        new = self._superseded(before, previous)
+        new = self._superseded(before, previous, f"{holder} took control")
         if previous is None or previous.epoch != epoch:
             self.record(EventKind.LEASE_GRANTED, f"{holder} took control", {"epoch": epoch, "holder": holder})
         return new
@@ -92,7 +98,7 @@ class Authority:
         self._gate.fence(epoch)
         if epoch == before and epoch <= self._gate.burned:
             raise Refused("lease_ended", f"lease {epoch} has ended at the device; take control again")
-        return self._superseded(before, previous)
+        return self._superseded(before, previous, "a newer lease took the device")
 
     def expire(self, now_s: float) -> None:
         """End an expired lease."""
@@ -109,7 +115,7 @@ class Authority:
         elif latch.verified and not self.latch.verified:
             self.latch = replace(latch, at_ms=self.latch.at_ms)
             self.record(EventKind.STOP_VERIFIED, f"{latch.caller} sent a signed Stop", data)
-        self.end(Refused("stopped", "the device was stopped"))
+        self.end(Refused("stopped", f"stopped by {self.latch.caller}"))
 
     def reset_stop(self) -> None:
         """Release the latch. Every lease so far ends."""
@@ -132,6 +138,17 @@ class Authority:
         self._record_end(lease or self._gate.granted, why)
         self._gate.burn()
         self.revoke(why)
+
+    def check_input(self, number: int) -> None:
+        """See ``LeaseGate.check_input``."""
+        self._gate.check_input(number)
+
+    def end_input(self, why: Refused) -> None:
+        """Hold until the operator starts a new input. Setpoints without an input number lose their lease."""
+        if self._gate.end_input():
+            self._hold(why)
+        else:
+            self.end(why)
 
     def reserve(self, epoch: int, on_revoked: Callable[[Refused], None]) -> Reservation:
         """Reserve the device for an action.
@@ -184,11 +201,11 @@ class Authority:
         """Record an event."""
         self._record(EventRecord(kind, message, severity, data))
 
-    def _superseded(self, before: int, previous: Lease | None) -> bool:
+    def _superseded(self, before: int, previous: Lease | None, message: str) -> bool:
         if self._gate.epoch == before:
             return False
         self.changed.set()
-        why = Refused("lease_lost", "a newer lease took the device")
+        why = Refused("lease_lost", message)
         self._record_end(previous, why)
         self.revoke(why)
         return True

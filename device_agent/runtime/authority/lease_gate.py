@@ -25,12 +25,14 @@ class LeaseGate:
     """Epochs of one device. Not thread-safe: the controller locks.
 
     ``epoch`` is the highest epoch seen. ``burned`` is the highest epoch that the device no longer accepts. An epoch is
-    burned when its lease ends, and when motion is held because setpoints stopped. Motion resumes only with a new epoch.
+    burned when its lease ends. ``input`` is the newest input of this epoch, and ``ended_input`` the highest one that
+    the device no longer accepts. After a watchdog hold, motion resumes only with a higher input.
     """
 
     def __init__(self, *, epoch: int = 0, burned: int = 0) -> None:
         self.epoch = epoch
         self.burned = max(burned, 0)
+        self.input = self.ended_input = 0
         self._lease: Lease | None = None
 
     def grant(
@@ -59,7 +61,24 @@ class LeaseGate:
             raise Refused("stale_epoch", f"from lease {epoch}, but lease {self.epoch} is in force")
         if epoch > self.epoch:
             self.epoch = epoch
+            self.input = self.ended_input = 0
             self._lease = None
+
+    def check_input(self, number: int) -> None:
+        """Accept the newest input, or a higher one, which ends all lower ones.
+
+        Raises:
+            Refused: The input has ended. In a lease with numbered inputs, this includes 0.
+        """
+        if self.input and number <= self.ended_input:
+            raise Refused("input_ended", f"input {number} has ended; release the control and start a new input")
+        if number > self.input:
+            self.input, self.ended_input = number, number - 1
+
+    def end_input(self) -> bool:
+        """End the newest input. Returns False if this lease has no numbered input."""
+        self.ended_input = self.input
+        return self.input > 0
 
     def current(self, now_s: float) -> Lease | None:
         """The lease in force, if any."""

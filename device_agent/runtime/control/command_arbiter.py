@@ -39,6 +39,7 @@ class ControlOutput:
     limited: tuple[str, ...]
     twist: Twist = REST
     stops: int = 0
+    ended_input: int = 0
 
 
 class CommandArbiter:
@@ -84,6 +85,7 @@ class CommandArbiter:
             limited,
             state.goals.twist,
             state.stops,
+            state.authority.ended_input if lease else 0,
         )
 
     def record_applied(self, position_rad: Sequence[float]) -> None:
@@ -136,10 +138,10 @@ class CommandArbiter:
                 stream.drive_base(goals.base, now_s, late_s=self._late_s, allowed=allowed)
             return Mode.STREAMING
         if self._state.mode is Mode.STREAMING and goals.faster_than(_CREEP_RAD_S):
-            authority.end(Refused("watchdog", "setpoints stopped arriving"))
+            authority.end_input(Refused("watchdog", f"no setpoint for {1000 * stream.age_s(now_s):.0f} ms"))
         stream.clear()
         goals.brake()
-        holds = self._state.mode is Mode.HOLDING and (goals.moving or authority.burned)
+        holds = self._state.mode is Mode.HOLDING and (goals.moving or authority.ended)
         return Mode.HOLDING if holds else Mode.IDLE
 
     def _limited(self) -> tuple[str, ...]:

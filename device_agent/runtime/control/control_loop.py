@@ -253,6 +253,7 @@ class ControlLoop:
                 setpoint_sequence=output.setpoint_sequence,
                 setpoint_sent_ms=output.setpoint_sent_ms,
                 loop_age_ms=output.loop_age_ms,
+                ended_input=output.ended_input,
                 limited=output.limited,
             )
         )

@@ -147,8 +147,8 @@ class Controller:
         """Accept a streamed setpoint; the newest replaces the previous one.
 
         Raises:
-            Refused: No lease, out of order, too old, or unknown joints; nothing changed. If the room holds the device,
-                the lease also ends, so that the device does not start when a person leaves.
+            Refused: No lease, out of order, too old, an ended input, or unknown joints; nothing moves. If the room
+                holds the device, the lease also ends, so that the device does not start when a person leaves.
         """
         with self._lock:
             state = self._state
@@ -156,6 +156,7 @@ class Controller:
             if lease is None or setpoint.epoch != lease.epoch:
                 raise Refused("no_lease", f"lease {setpoint.epoch} is not in force")
             state.stream.check(setpoint, tick_ms=tick_ms)
+            state.authority.check_input(setpoint.input)
             try:
                 state.authority.check_free()
             except Refused as refused:

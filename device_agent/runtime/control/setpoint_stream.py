@@ -131,9 +131,13 @@ class SetpointStream:
         """Whether there is a setpoint that may still apply."""
         return self._received_s > -math.inf
 
+    def age_s(self, now_s: float) -> float:
+        """Time since the newest setpoint [s]."""
+        return now_s - self._received_s
+
     def is_fresh(self, now_s: float, braking_s: float, *, late_s: float) -> bool:
         """Whether the newest setpoint applies: braking after this period still ends before the watchdog time."""
-        return _is_fresh(now_s - self._received_s, braking_s, late_s, _MIN_FRESH_S)
+        return _is_fresh(self.age_s(now_s), braking_s, late_s, _MIN_FRESH_S)
 
     def drive_base(self, base: BaseMotion, now_s: float, *, late_s: float, allowed: float) -> None:
         """Move the base at the newest twist while it is fresh; else brake.

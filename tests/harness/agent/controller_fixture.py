@@ -11,6 +11,7 @@ from device_agent.ports.geometry import Clearance, RobotGeometry, Sweep, never
 from device_agent.protocol import DriveTarget, JogTarget, JointTarget, Mode, Pose, Setpoint, StopLatch
 from device_agent.protocol.manifests.robot_type import Base
 from device_agent.runtime.authority.authority import Reservation
+from device_agent.runtime.authority.event_recorder import RecordEvent, ignore_event
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.controller import Controller
@@ -25,12 +26,19 @@ Target = JointTarget | JogTarget | DriveTarget
 class ControllerFixture:
     """A controller with its own clock, and an operator whose setpoints refer to the newest telemetry."""
 
-    def __init__(self, *, geometry: RobotGeometry | None = None, base: Base | None = None, **gate: int) -> None:
-        self.controller = Controller(robot_type(base), LeaseGate(**gate), geometry=geometry)
+    def __init__(
+        self,
+        *,
+        geometry: RobotGeometry | None = None,
+        base: Base | None = None,
+        record: RecordEvent = ignore_event,
+        **gate: int,
+    ) -> None:
+        self.controller = Controller(robot_type(base), LeaseGate(**gate), geometry=geometry, record=record)
         self.controller.start_at([0.0, 0.0])
         self.limited: set[str] = set()
         self.now_s = 100.0
-        self.sequence = 0
+        self.sequence = self.input = 0
         self.velocities: list[float] = []
         self.outputs = list[ControlOutput]()
         self.revocations: list[Refused] = []
@@ -64,6 +72,10 @@ class ControllerFixture:
         self.controller.grant(epoch=epoch, holder="ann", lease_s=lease_s, now_s=self.now_s)
         self.sequence = 0
 
+    def press(self) -> None:
+        """Start a new input; without one, setpoints have no input number."""
+        self.input += 1
+
     def offer(self, epoch: int, target: float | Target = 2.0, *, age_ms: int = 20, sequence: int | None = None) -> None:
         """Send a setpoint: a target, or the position of the elbow [rad]."""
         self.sequence += 1
@@ -72,6 +84,7 @@ class ControllerFixture:
             sequence=self.sequence if sequence is None else sequence,
             echo_tick_ms=self.tick_ms - age_ms,
             sent_ms=1.0,
+            input=self.input,
             target=JointTarget(position_rad={"elbow": target}) if isinstance(target, float | int) else target,
         )
         self.controller.accept_setpoint(setpoint, now_s=self.now_s, tick_ms=self.tick_ms)

@@ -152,10 +152,14 @@ class DeviceHarness:
         """Receive a setpoint of the lease's holder."""
         self.receive(topics.CTL, self.sealed(epoch, sequence, elbow), str(epoch))
 
-    def sealed(self, epoch: int, sequence: int, elbow: float = 2.0, *, key: Ed25519PrivateKey | None = None) -> bytes:
-        """A setpoint, sealed with the key of a lease that the cloud with this ``key`` granted."""
+    def sealed(
+        self, epoch: int, sequence: int, elbow: float = 2.0, *, number: int = 0, key: Ed25519PrivateKey | None = None
+    ) -> bytes:
+        """A setpoint of input ``number``, sealed with the key of a lease that the cloud with this ``key`` granted."""
         target = JointTarget(position_rad={"elbow": elbow})
-        setpoint = Setpoint(epoch=epoch, sequence=sequence, echo_tick_ms=tick_ms(), sent_ms=0.5, target=target)
+        setpoint = Setpoint(
+            epoch=epoch, sequence=sequence, echo_tick_ms=tick_ms(), sent_ms=0.5, target=target, input=number
+        )
         topic = topics.device("s", "a", "arm", topics.CTL, str(epoch))
         lease_key = setpoints.lease_key(key or self.key, IDENTITY.public_key(), topic=topic, pairing="")
         return setpoints.seal(codec.encode(setpoint), lease_key, topic)

@@ -70,8 +70,8 @@ class AttackedDevice(DeviceHarness):
         super().receive(kind, payload, name)
 
     def new_setpoint(self, epoch: int, sequence: int) -> bytes:
-        """The operator's next setpoint, sealed."""
-        payload = self.sealed(epoch, sequence, (sequence % 7) / 10)
+        """The operator's next setpoint, sealed. Each input has ten setpoints."""
+        payload = self.sealed(epoch, sequence, (sequence % 7) / 10, number=1 + sequence // 10)
         self.sent.append(codec.decode(bytes(codec.decode(payload, setpoints.Tagged).body), Setpoint))
         return payload
 
@@ -152,8 +152,11 @@ class HostileBroker:
         for _ in range(self.random.randrange(1, 4)):
             at = self.random.randrange(len(edited))
             edited[at] ^= 1 << self.random.randrange(8)
-        if self.random.random() < 0.3:
+        choice = self.random.random()
+        if choice < 0.3:
             edited = bytearray(payload.replace(b'"elbow"', b'"shoulder"').replace(b'"sequence":', b'"sequence":9'))
+        elif choice < 0.4:
+            edited = bytearray(payload.replace(b'"input":', b'"input":9'))
         return (topic, bytes(edited)) if edited != payload else (topic, b"")
 
     def _inject_setpoint(self) -> tuple[str, bytes]:

@@ -32,6 +32,8 @@ def attack(folder: Path, messages: int, caplog: pytest.LogCaptureFixture, seed: 
     order = [(each.epoch, each.sequence) for each in victim.accepted]
     assert order == sorted(set(order)), "no setpoint is applied twice or after a newer one"
     assert [each for each in victim.accepted if each not in victim.sent] == []
+    inputs = [(each.epoch, each.input) for each in victim.accepted]
+    assert inputs == sorted(inputs), "no ended input applies again"
     assert len(victim.accepted) > len(victim.sent) / 4, "the attack does not stop the honest operator"
     started = [ack.id for ack in victim.published(topics.ACK, Ack) if ack.status is AckStatus.STARTED]
     assert len(started) == len(set(started)) > 0

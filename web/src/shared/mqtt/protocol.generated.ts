@@ -365,6 +365,7 @@ export interface Restriction {
  * epoch: Epoch of the lease in force at the device, 0 for none. A holder that reads 0 has lost control.
  * setpoint_sequence: Newest setpoint that the control loop has accepted; 0 for none in this lease.
  * setpoint_sent_ms: `sent_ms` of that setpoint, so that the operator measures its round trip on one clock.
+ * ended_input: Highest `input` of this lease whose setpoints the device no longer accepts; 0 for none.
  * limited: Limits that changed a setpoint before it reached the motors.
  */
 export interface JointTelemetry {
@@ -381,6 +382,7 @@ export interface JointTelemetry {
   setpoint_sequence?: number;
   setpoint_sent_ms?: number;
   loop_age_ms?: number;
+  ended_input?: number;
   limited?: string[];
 }
 
@@ -572,6 +574,9 @@ export interface SetControl {
  * echo_tick_ms: `tick_ms` of the newest telemetry that the operator has received. Its age on the robot's own
  * clock is the loop age.
  * sent_ms: Time of sending on any clock of the operator [ms]; telemetry echoes it.
+ * input: Number of the operator's input in this lease, from 1: each press of a pointer, key or gamepad starts a
+ * new one. After a watchdog hold the device accepts only a higher number. 0: not numbered; a watchdog hold
+ * then ends the lease.
  */
 export interface Setpoint {
   epoch: number;
@@ -579,6 +584,7 @@ export interface Setpoint {
   echo_tick_ms: number;
   sent_ms: number;
   target: JointTarget | JogTarget | DriveTarget;
+  input?: number;
 }
 
 /** Move to joint positions as fast as the limits allow. */

@@ -71,6 +71,7 @@ class RandomRun:
         self.controller = ControllerFixture(geometry=self.shape, base=BASE).controller
         self.now_s = 100.0
         self.epoch = self.sequence = self.burned = self.slowed_for = 0
+        self.numbered, self.input, self.ended_input = self.random.random() < 0.7, 0, 0
         self.reservation: Reservation | None = None
         self.may_move_until_s = -1.0
         self.position, self.velocity, self.twist = [0.0, 0.0], [0.0, 0.0], REST
@@ -122,8 +123,9 @@ class RandomRun:
         return True
 
     def setpoint(self) -> None:
-        if self.reservation is None and self.clear_obstacles():
+        if self.reservation is None and self.random.random() < 0.7 and self.clear_obstacles():
             self.grant()
+        self.input += self.numbered and self.random.random() < 0.6
         target = self.target()
         for _ in range(self.random.choice((1, 5, 20, 60, 120))):
             self.sequence += 1
@@ -133,10 +135,12 @@ class RandomRun:
                 sequence=self.sequence,
                 echo_tick_ms=tick_ms - self.random.randint(0, 210),
                 sent_ms=0.0,
+                input=self.input,
                 target=target() if callable(target) else target,
             )
             self.controller.accept_setpoint(setpoint, now_s=self.now_s, tick_ms=tick_ms)
             assert self.epoch > self.burned, "accepted although the lease has ended"
+            assert not self.input or self.input > self.ended_input, "accepted although the input has ended"
             assert self.speed() > 0, "accepted although the room holds the device"
             self.may_move_until_s = self.now_s + REST_WITHIN_S
             self.rest_from_s = self.now_s + REST_WITHIN_S
@@ -240,6 +244,7 @@ class RandomRun:
     def tick(self, elapsed_s: float = PERIOD_S) -> None:
         self.now_s += elapsed_s
         output = self.controller.update(self.now_s, elapsed_s=None if elapsed_s == PERIOD_S else elapsed_s)
+        self.ended_input = output.ended_input
         between_s, self.elapsed_s = (self.elapsed_s + elapsed_s) / 2, elapsed_s
         faster = False
         self.slowed_for = self.slowed_for + 1 if self.speed() == self.share else 0
