@@ -114,7 +114,7 @@ class HostileBroker:
         self._epoch, self._sequence = self._epoch + 1, 0
         victim.done(GrantLease(holder="ann", lease_ms=600_000), epoch=self._epoch)
         self.delivered += 1
-        if self.random.random() < 0.2:
+        if self._epoch == 1 or self.random.random() < 0.2:
             victim.done(MoveJoints(position_rad={"elbow": self.random.random()}, speed=1.0), epoch=self._epoch)
             self.delivered += 1
 
