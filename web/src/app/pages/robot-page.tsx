@@ -77,7 +77,7 @@ function Operate({ api, fleet, device, account }: OperateProps) {
   const access = <DeviceAccess api={api} fleet={fleet} device={device} account={account} />;
   return (
     <>
-      <ControlBar device={device} control={control} stop={stop} watchers={session.watchers} />
+      <ControlBar session={session} watchers={session.watchers} />
       <main class="page operate" id="content">
         <Heading api={api} device={device} fleet={fleet} />
         <StopBanner device={device} stop={stop} />

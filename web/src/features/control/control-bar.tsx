@@ -1,8 +1,9 @@
 import type { DeviceStore } from "../devices/model";
 import { useEffect, useId, useState } from "preact/hooks";
 import { accountLabel } from "../../shared/lib/account-label";
+import type { DeviceSession } from "./model/device-session";
 import type { Control } from "./model/lease";
-import type { StopSwitch } from "./model/stop";
+import { ownAction, reportedEnd } from "./model/status";
 import type { Watchers } from "./model/watchers";
 import { texts } from "./texts";
 import "./control-bar.css";
@@ -11,15 +12,14 @@ import { AnswerRequest, RequestControlButton, PendingRequest, TakeOverForm } fro
 import { WatcherNames, WatchersButton } from "./watcher-list";
 
 interface ControlBarProps {
-  device: DeviceStore;
-  control: Control;
-  stop: StopSwitch;
+  session: DeviceSession;
   /** Other viewers, if tracked. */
   watchers?: Watchers;
 }
 
 /** Always visible: the lease holder, take, request and release control, other viewers, and Stop. */
-export function ControlBar({ device, control, stop, watchers }: ControlBarProps) {
+export function ControlBar({ session, watchers }: ControlBarProps) {
+  const { device, control, stop } = session;
   const names = useId();
   const [open, setOpen] = useState(false);
   const [takingOver, setTakingOver] = useState(false);
@@ -28,7 +28,7 @@ export function ControlBar({ device, control, stop, watchers }: ControlBarProps)
   useAccountIds(device);
   return (
     <div class="control-bar" role="region" aria-label={texts.control.title}>
-      <ControlState device={device} control={control} />
+      <ControlState session={session} />
       {watchers !== undefined && <WatchersButton watchers={watchers} open={open} names={names} onToggle={() => setOpen(!open)} />}
       <LeaseButton device={device} control={control} />
       {!takingOver && mayTakeOver(device, control) && (
@@ -111,10 +111,10 @@ function LeaseButton({ device, control }: { device: DeviceStore; control: Contro
   );
 }
 
-type Shown = "mine" | "other" | "free" | "lost" | "refused" | "taking" | "handed";
+type Shown = "mine" | "running" | "other" | "free" | "lost" | "refused" | "taking" | "handed";
 
-function ControlState({ device, control }: { device: DeviceStore; control: Control }) {
-  const [shown, text] = describe(device, control);
+function ControlState({ session }: { session: DeviceSession }) {
+  const [shown, text] = describe(session);
   return (
     <p class={`control-state control-${shown}`} data-testid="control-state" data-state={shown} role="status">
       <span class="dot" aria-hidden="true" />
@@ -123,19 +123,25 @@ function ControlState({ device, control }: { device: DeviceStore; control: Contr
   );
 }
 
-function describe(device: DeviceStore, control: Control): [Shown, string] {
+function describe(session: DeviceSession): [Shown, string] {
+  const { device, control } = session;
   const state = control.state.value;
   const holder = device.holder.value;
   const lease = device.state.value?.lease ?? null;
   const reason = lease !== null && lease.holder === holder?.name ? (lease.reason ?? "") : "";
   const name = holder === null ? "" : accountLabel(holder.name, holder.account);
+  const action = ownAction(session);
+  if (action !== null && state.kind !== "taking") {
+    const text = action.elsewhere ? texts.control.runningElsewhere : texts.control.running;
+    return [state.kind === "held" ? "mine" : "running", text(action.name)];
+  }
   switch (state.kind) {
     case "taking":
       return ["taking", texts.control.taking];
     case "held":
       return ["mine", state.confirmed ? texts.control.mine : texts.control.unconfirmed];
     case "lost":
-      return ["lost", texts.control.lost(holder === null || reason === "" ? state.reason : texts.control.tookOver(name, reason))];
+      return ["lost", texts.control.lost(reason === "" ? lostReason(device, state.epoch, name, state.reason) : texts.control.tookOver(name, reason))];
     case "refused":
       return ["refused", texts.control.refused(state.reason)];
     case "handed":
@@ -145,4 +151,14 @@ function describe(device: DeviceStore, control: Control): [Shown, string] {
       if (holder.mine) return ["other", texts.control.elsewhere];
       return ["other", reason === "" ? texts.control.other(name) : texts.control.tookOver(name, reason)];
   }
+}
+
+/** Why control was lost: the robot's own report if it has arrived, otherwise the page's. */
+function lostReason(device: DeviceStore, epoch: number, holder: string, otherwise: string): string {
+  const reported = reportedEnd(device, epoch);
+  const stop = device.state.value?.stop?.caller;
+  // The state names a verified author, once a signed Stop has followed.
+  if (stop !== undefined && (reported === null || reported.code === "stopped")) return texts.control.stopped(stop);
+  if (reported !== null) return reported.code === "fault" ? texts.control.fault(reported.message) : reported.message;
+  return holder === "" ? otherwise : texts.control.taken(holder);
 }

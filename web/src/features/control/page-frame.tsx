@@ -48,7 +48,7 @@ function DevicePage({ api, fleet, account, device, page, children }: FramedProps
   ] as const;
   return (
     <>
-      <ControlBar device={device} control={session.control} stop={session.stop} />
+      <ControlBar session={session} />
       <main class="page operate monitoring" id="content">
         <div class="heading">
           <a href={deviceListAddress}>← {common.allDevices}</a>

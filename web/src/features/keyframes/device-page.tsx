@@ -48,7 +48,7 @@ function OfDevice({ api, fleet, account, device, name }: OfDeviceProps) {
   if (session === undefined) return null;
   return (
     <>
-      <ControlBar device={device} control={session.control} stop={session.stop} />
+      <ControlBar session={session} />
       <main class="page operate kf-page" id="content">
         <div class="heading">
           <a href={deviceAddress(device.id)}>← {label}</a>

@@ -24,7 +24,7 @@ interface BlockedNoticeProps {
 
 export function BlockedNotice({ device, streamer, blocked }: BlockedNoticeProps) {
   const [state, text] = streamText(device, streamer, blocked);
-  const limited = state === "streaming" && device.limited.value !== "";
+  const limited = state === "streaming" && (device.limited.value !== "" || streamer?.warning.value !== null);
   return (
     <span class={`quiet stream-${limited ? "limited" : state}`} data-testid="stream-state" data-state={state} role="status">
       {text}
@@ -35,11 +35,14 @@ export function BlockedNotice({ device, streamer, blocked }: BlockedNoticeProps)
 function streamText(device: DeviceStore, streamer: SetpointStreamer | null, blocked: string | null): [string, string] {
   if (blocked !== null || streamer === null) return ["blocked", blocked ?? ""];
   const state = streamer.state.value;
+  const warning = streamer.warning.value;
+  if (state !== "idle" && warning !== null) return [state, texts.joints.warning(warning)];
   if (state === "waiting") return [state, texts.joints.waiting];
   if (state === "streaming") {
     if (device.limited.value !== "") return [state, texts.joints.limited(device.limited.value)];
     return [state, streamer.steeringMode.value === "joints" ? texts.joints.streaming : texts.steer.holding];
   }
   const ended = streamer.ended.value;
+  if (ended === "paused") return ["paused", texts.joints.paused(streamer.pause.value)];
   return [state, ended === null ? "" : texts.joints.ended[ended]];
 }

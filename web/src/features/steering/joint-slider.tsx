@@ -11,6 +11,8 @@ interface JointSliderProps {
   targetRad: number | undefined;
   /** Measured position [rad]; `undefined`: not measured. */
   measuredRad: number | undefined;
+  /** Starts a new input: a press, a key that is not repeated, or a typed number. */
+  onBegin?: () => void;
   /** Sets the target [rad]; `null`: disabled. */
   onSet: ((positionRad: number) => void) | null;
   /** The measurement is out of date. */
@@ -19,12 +21,22 @@ interface JointSliderProps {
   selected?: boolean;
 }
 
-export function JointSlider({ joint, targetRad, measuredRad, onSet, old = false, selected = false }: JointSliderProps) {
+export function JointSlider({ joint, targetRad, measuredRad, onBegin, onSet, old = false, selected = false }: JointSliderProps) {
   const measured = measuredRad === undefined ? undefined : degrees(measuredRad);
   const target = targetRad === undefined ? undefined : degrees(targetRad);
   const lower = degrees(joint.lower_rad);
   const upper = degrees(joint.upper_rad);
+  const pressed = useRef(false);
+  // The slider shows its target, also if the target did not take over the position of the pointer.
+  const [, redraw] = useState({});
   const set = (deg: number): void => onSet?.(radians(deg));
+  const setTyped = (deg: number): void => {
+    onBegin?.();
+    set(deg);
+  };
+  const release = (): void => {
+    pressed.current = false;
+  };
   return (
     <div
       class={`joint ${old ? "old" : ""} ${selected ? "selected" : ""}`}
@@ -34,7 +46,7 @@ export function JointSlider({ joint, targetRad, measuredRad, onSet, old = false,
       data-testid={`joint-${joint.name}`}
     >
       <span class="joint-name">{joint.label}</span>
-      <TargetField joint={joint} target={target} disabled={onSet === null} onSet={set} />
+      <TargetField joint={joint} target={target} disabled={onSet === null} onSet={setTyped} />
       <span
         class="measured"
         data-testid={`measured-${joint.name}`}
@@ -58,11 +70,23 @@ export function JointSlider({ joint, targetRad, measuredRad, onSet, old = false,
           step="any"
           value={target ?? (lower + upper) / 2}
           disabled={onSet === null || target === undefined}
-          onInput={(event) => set(event.currentTarget.valueAsNumber)}
+          onPointerDown={() => {
+            pressed.current = true;
+            onBegin?.();
+          }}
+          onPointerUp={release}
+          onPointerCancel={release}
+          onInput={(event) => {
+            // Assistive technology sets values without a press: each is an input of its own.
+            if (!pressed.current) onBegin?.();
+            set(event.currentTarget.valueAsNumber);
+            redraw({});
+          }}
           onKeyDown={(event) => {
             const step = stepOf(event);
             if (step === null) return;
             event.preventDefault();
+            if (!event.repeat) onBegin?.();
             if (target !== undefined && step !== 0) set(target + step);
           }}
         />

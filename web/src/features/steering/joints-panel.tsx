@@ -93,6 +93,7 @@ function LiveJoint({ joint, index, device, telemetry, streamer, selected }: Live
       measuredRad={measured.value}
       old={!device.live.value}
       selected={selected}
+      onBegin={() => streamer?.begin()}
       onSet={streamer === null ? null : (positionRad) => streamer.setTarget(joint.name, positionRad)}
     />
   );
@@ -112,15 +113,20 @@ function useShown(
 /** Moves the selected joint while a key or gamepad stick is held; the target leads by a small amount. */
 function useJointJog({ device, streamer, active, pad }: PanelProps, selected: number): void {
   const rate = useRef(0);
+  const newest = useRef(streamer);
+  newest.current = streamer;
   const inputs = useMemo(
     () =>
-      new PressedInputs<number>((parts) => {
-        rate.current = clamp(
-          parts.reduce((sum, part) => sum + part, 0),
-          -1,
-          1,
-        );
-      }),
+      new PressedInputs<number>(
+        (parts) => {
+          rate.current = clamp(
+            parts.reduce((sum, part) => sum + part, 0),
+            -1,
+            1,
+          );
+        },
+        () => newest.current?.begin(),
+      ),
     [],
   );
   // Without control, arrow keys scroll the page.

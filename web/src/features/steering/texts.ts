@@ -1,5 +1,12 @@
-import type { EndedBecause } from "./model/setpoint-streamer";
+import type { Delay } from "./model/delay-meter";
+import { WATCHDOG_MS, type EndedBecause } from "./model/setpoint-streamer";
 import type { SteeringMode } from "./model/steerable-parts";
+
+const CAUSES: Readonly<Record<Delay["cause"], string>> = {
+  browser: "this browser was busy",
+  network: "the network was late",
+  robot: "the robot's computer was late",
+};
 
 export const texts = {
   joints: {
@@ -16,6 +23,9 @@ export const texts = {
     busy: "An action is running.",
     stopped: "The robot is stopped.",
     limited: (limits: string): string => `Limited by the robot: ${limits}`,
+    warning: ({ cause, ms }: Delay): string => `Slow: ${CAUSES[cause]} (${ms} ms). The robot pauses after ${WATCHDOG_MS} ms.`,
+    paused: (delay: Delay | null): string =>
+      `Paused: no setpoint for ${delay === null ? `${WATCHDOG_MS} ms` : `${delay.ms} ms (${CAUSES[delay.cause]})`}. Release the control and press it again to continue.`,
     noDescription: "Waiting for the robot's description…",
     ended: {
       reached: "Target reached",
@@ -26,7 +36,7 @@ export const texts = {
       "no-telemetry": "Ended: no recent telemetry from the robot. Move the slider again to continue.",
       busy: "Ended: an action is running",
       "no-connection": "Ended: no connection for setpoints. Move the slider again to continue.",
-    } satisfies Record<Exclude<EndedBecause, null>, string>,
+    } satisfies Record<Exclude<EndedBecause, "paused" | null>, string>,
   },
 
   steer: {

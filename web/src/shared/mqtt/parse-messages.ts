@@ -184,6 +184,7 @@ const jointTelemetry = object<Required<JointTelemetry>>({
   setpoint_sequence: optional(count, 0),
   setpoint_sent_ms: optional(number, 0),
   loop_age_ms: optional(number, 0),
+  ended_input: optional(count, 0),
   limited: optional(list(text, MAX_JOINTS), []),
 });
 

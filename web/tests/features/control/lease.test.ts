@@ -90,7 +90,7 @@ describe("control of a device", () => {
     expect(setpoints.published.length).toBeGreaterThan(10);
     renewal = () => problem(409, "lease-lost", "Ann has control.");
     await pass(110);
-    expect(control.state.value).toEqual({ kind: "lost", reason: "Ann has control." });
+    expect(control.state.value).toEqual({ kind: "lost", epoch: 5, reason: "Ann has control." });
     expect(control.streamer.value).toBeNull();
     expect(setpoints.status.value.state).toBe("closed");
     const sent = setpoints.published.length;

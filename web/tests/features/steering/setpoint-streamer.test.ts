@@ -1,7 +1,7 @@
 import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
 import { readTelemetry, type KnownTelemetry } from "../../../src/shared/mqtt/parse-messages";
 import type { DriveTarget, JogTarget, Joint, Mode, Setpoint } from "../../../src/shared/mqtt/protocol.generated";
-import { ABANDON_MS, FRESH_MS, LOST_MS, PERIOD_MS, SETTLE_MS, SetpointStreamer, STUCK_MS } from "../../../src/features/steering/model/setpoint-streamer";
+import { ABANDON_MS, FRESH_MS, LOST_MS, PERIOD_MS, SETTLE_MS, SetpointStreamer, STUCK_MS, WATCHDOG_MS } from "../../../src/features/steering/model/setpoint-streamer";
 import { bytes, telemetry } from "../../support/messages";
 
 const LIMITS = { max_velocity_rad_s: 1, max_acceleration_rad_s2: 1, max_jerk_rad_s3: 1, max_effort_nm: 1 };
@@ -17,6 +17,7 @@ class SimulatedRobot {
   silent = false;
   connected = true;
   sequence = 0;
+  endedInput = 0;
   readonly streamer: SetpointStreamer;
 
   constructor() {
@@ -42,6 +43,7 @@ class SimulatedRobot {
       velocity_rad_s: moved.map((step) => step / 0.02),
       effort_nm: [0, 0],
       setpoint_sequence: Math.max(this.sequence, this.sent.at(-1)?.sequence ?? 0),
+      ended_input: this.endedInput,
     });
     this.latest = { message: readTelemetry(bytes(message)), receivedAt: performance.now() };
   }
@@ -101,7 +103,7 @@ describe("a stream of joint targets", () => {
     streamer.setTarget("a", 0.9);
     await robot.run(100);
     const target = { kind: "joints", position_rad: { a: 1, b: 0.25 } };
-    expect(robot.sent[0]).toEqual({ epoch: 7, sequence: 1, echo_tick_ms: echo, sent_ms: expect.any(Number) as number, target });
+    expect(robot.sent[0]).toEqual({ epoch: 7, sequence: 1, echo_tick_ms: echo, sent_ms: expect.any(Number) as number, input: 1, target });
     expect(robot.newest()).toEqual({ a: 0.9, b: 0.25 });
     expect(robot.sent.map(({ sequence }) => sequence)).toEqual(robot.sent.map((_, index) => index + 1));
     expect(robot.sent.at(-1)?.echo_tick_ms).toBeGreaterThan(echo);
@@ -297,5 +299,102 @@ describe("a velocity", () => {
     streamer.release(); // No velocity is active, so this has no effect.
     await robot.run(60);
     expect(streamer.steeringMode.value).toBe("joints");
+  });
+});
+
+/** Blocks the page's timers for `ms`: the clock advances, but no timer runs. */
+function freeze(ms: number): void {
+  vi.setSystemTime(Date.now() + ms);
+  clockSkew += ms;
+}
+let clockSkew = 0;
+const DRIVE: DriveTarget = { kind: "drive", forward_m_s: 0.3, left_m_s: 0, turn_rad_s: 0 };
+
+describe("a gap in the setpoints", () => {
+  beforeEach(() => {
+    clockSkew = 0;
+    const measured = performance.now.bind(performance);
+    vi.spyOn(performance, "now").mockImplementation(() => measured() + clockSkew);
+  });
+  afterEach(() => {
+    vi.restoreAllMocks();
+  });
+
+  it("of a busy browser pauses the input, which continues only after a new press, with a higher number", async () => {
+    streamer.begin();
+    streamer.setTarget("a", 1.9);
+    await robot.run(200);
+    freeze(WATCHDOG_MS + 20);
+    await robot.run(40);
+    expect([streamer.state.value, streamer.ended.value]).toEqual(["idle", "paused"]);
+    expect(streamer.pause.value?.cause).toBe("browser");
+    expect(streamer.pause.value?.ms).toBeGreaterThanOrEqual(WATCHDOG_MS + 20);
+    expect(streamer.pause.value?.ms).toBeLessThan(WATCHDOG_MS + 80);
+    expect(streamer.targets.value["a"]).toBeCloseTo(robot.position[0] ?? NaN);
+    streamer.setTarget("a", 1.5);
+    streamer.setVelocity(DRIVE);
+    await expectNothingMoreSent();
+    streamer.begin();
+    streamer.setTarget("a", 1.5);
+    await robot.run(100);
+    expect([streamer.state.value, robot.sent.at(-1)?.input]).toEqual(["streaming", 2]);
+  });
+
+  it("also ends an input that rests at its target, but not the press that follows the gap", async () => {
+    streamer.begin();
+    streamer.setTarget("a", 0.6);
+    await robot.run(1_000);
+    expect(streamer.ended.value).toBe("reached");
+    streamer.setTarget("a", 0.7);
+    await robot.run(1_000);
+    expect(robot.position[0]).toBeCloseTo(0.7);
+    const count = robot.sent.length;
+    freeze(2_000);
+    streamer.setTarget("a", 1.9);
+    expect(robot.sent).toHaveLength(count);
+    freeze(2_000);
+    streamer.begin();
+    robot.measure();
+    streamer.setTarget("a", 1.9);
+    expect(robot.sent.at(-1)?.input).toBe(2);
+  });
+
+  it("that the robot reports pauses the input, and the numbers continue above the reported one", async () => {
+    streamer.begin();
+    streamer.setTarget("a", 1.9);
+    await robot.run(100);
+    robot.endedInput = 4;
+    await robot.run(60);
+    expect([streamer.state.value, streamer.ended.value]).toEqual(["idle", "paused"]);
+    await expectNothingMoreSent();
+    streamer.begin();
+    streamer.setTarget("a", 1.9);
+    expect(robot.sent.at(-1)?.input).toBe(5);
+  });
+
+  it("of a velocity sends nothing more, not even velocity zero", async () => {
+    streamer.begin();
+    streamer.setVelocity(DRIVE);
+    await robot.run(100);
+    robot.endedInput = 1;
+    const count = robot.sent.length;
+    await robot.run(60);
+    expect(streamer.ended.value).toBe("paused");
+    expect(robot.sent.length).toBeLessThanOrEqual(count + 1);
+    expect(robot.sent.at(-1)?.target).toEqual(DRIVE);
+  });
+
+  it("is announced by a warning while it is short, which ends with the delay", async () => {
+    streamer.begin();
+    streamer.setTarget("a", 1.9);
+    await robot.run(100);
+    expect(streamer.warning.value).toBeNull();
+    freeze(150);
+    await robot.run(40);
+    expect(streamer.state.value).not.toBe("idle");
+    expect(streamer.warning.value?.cause).toBe("browser");
+    robot.blocked = true;
+    await robot.run(1_600);
+    expect(streamer.warning.value).toBeNull();
   });
 });

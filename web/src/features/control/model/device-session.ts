@@ -11,6 +11,8 @@ import type { Link } from "../../../shared/mqtt/mqtt-link";
 
 export class DeviceSession {
   readonly device: DeviceStore;
+  /** Id of this account. */
+  readonly account: string;
   readonly control: Control;
   readonly stop: StopSwitch;
   readonly actions: ActionRunner;
@@ -19,12 +21,12 @@ export class DeviceSession {
   readonly watchers: Watchers;
   readonly #unwatch: () => void;
 
-  /** `author`: the account that sends Stop. */
-  constructor(api: Api, link: Link, device: DeviceStore, author: string) {
+  constructor(api: Api, link: Link, device: DeviceStore, account: string) {
     this.device = device;
+    this.account = account;
     this.#unwatch = device.watchDetails();
     this.control = new Control(api, device);
-    this.stop = new StopSwitch(api, device, link, author);
+    this.stop = new StopSwitch(api, device, link, account);
     this.actions = new ActionRunner(api, device);
     this.commandTrace = new CommandTrace(device, this.control, this.actions);
     this.#samples = new LatencySamples(api, device.id, this.control.roundTrip);

@@ -18,7 +18,8 @@ type ControlState =
   | { kind: "none" }
   | { kind: "taking" }
   | { kind: "held"; epoch: number; confirmed: boolean }
-  | { kind: "lost"; reason: string }
+  /** `epoch`: the lease that ended. */
+  | { kind: "lost"; epoch: number; reason: string }
   /** Handed over to the requester. */
   | { kind: "handed"; to: string }
   | { kind: "refused"; reason: string };
@@ -141,7 +142,7 @@ export class Control {
     } catch (error) {
       // The lease expires soon; the page already stopped streaming.
       if (!(error instanceof ApiError && error.code === "lease-lost")) {
-        this.#state.value = { kind: "lost", reason: sentence(error) };
+        this.#state.value = { kind: "lost", epoch, reason: sentence(error) };
       }
     }
   }
@@ -206,14 +207,14 @@ export class Control {
         return;
       }
       if (reportedEpoch > epoch) {
-        this.#lose("Another operator has control now.");
+        this.#lose("another operator has control");
         return;
       }
       if (latest?.message.epoch === epoch) {
         this.#epochReported = true;
         if (!current.confirmed) this.#state.value = { ...current, confirmed: true };
       } else if (this.#epochReported && latest?.message.epoch === 0) {
-        this.#lose("The robot ended it because it was stopped or had to hold its position. Take control again to continue.");
+        this.#lose("the robot ended it");
         // This lease is unusable: release it, so that other operators can take the next one.
         void this.#api.releaseLease(this.#device.id, epoch, false).catch(() => undefined).then(() => this.#device.refreshLease());
         return;
@@ -229,7 +230,7 @@ export class Control {
     this.#setpointKey = granted.setpoint_key;
     clearTimeout(this.#expiry);
     this.#expiry = setTimeout(
-      () => this.#lose("It expired because the server could not be reached in time to renew it."),
+      () => this.#lose("it expired because the server could not be reached in time to renew it"),
       requestedAt + granted.lease_ms - now(),
     );
     this.#scheduleRenewal(granted.epoch, granted.lease_ms / 3);
@@ -263,8 +264,9 @@ export class Control {
   }
 
   #lose(reason: string): void {
-    if (this.epoch === null) return;
-    this.#end({ kind: "lost", reason });
+    const { epoch } = this;
+    if (epoch === null) return;
+    this.#end({ kind: "lost", epoch, reason });
     void this.#device.refreshLease();
   }
 

@@ -15,11 +15,14 @@ export function usePressedInputs<T>(streamer: SetpointStreamer | null, toVelocit
   newest.current = { streamer, toVelocity };
   const inputs = useMemo(
     () =>
-      new PressedInputs<T>((parts) => {
-        const { streamer: to, toVelocity: convert } = newest.current;
-        if (parts.length === 0) to?.release();
-        else to?.setVelocity(convert(parts));
-      }),
+      new PressedInputs<T>(
+        (parts) => {
+          const { streamer: to, toVelocity: convert } = newest.current;
+          if (parts.length === 0) to?.release();
+          else to?.setVelocity(convert(parts));
+        },
+        () => newest.current.streamer?.begin(),
+      ),
     [],
   );
   // The speed or axes may have changed: send the velocity again.

@@ -1,1 +1,2 @@
+export type { Delay } from "./delay-meter";
 export { SetpointStreamer, type Targets } from "./setpoint-streamer";

@@ -6,15 +6,21 @@ export class PressedInputs<T> {
   readonly #parts = new Map<string, T>();
   readonly #spent = new Set<string>();
   readonly #onChange: (parts: readonly T[]) => void;
+  readonly #onPress: () => void;
 
-  /** `onChange`: called after every change; an empty list means that no input is pressed. */
-  constructor(onChange: (parts: readonly T[]) => void) {
+  /**
+   * `onChange`: called after every change; an empty list means that no input is pressed. `onPress`: called before it for a new
+   * press.
+   */
+  constructor(onChange: (parts: readonly T[]) => void, onPress: () => void = () => undefined) {
     this.#onChange = onChange;
+    this.#onPress = onPress;
   }
 
   /** A new press. */
   press(name: string, part: T): void {
     this.#spent.delete(name);
+    this.#onPress();
     this.update(name, part);
   }
 

@@ -1,13 +1,14 @@
 /**
  * Streams setpoints to one device at 40 Hz while the lease is held and telemetry is recent: joint targets until they are
  * reached, or a velocity of a frame or the base while an input is held. Only the newest of them is active. Missing data ends
- * the stream, which never resumes automatically.
+ * the stream and the operator's input: only a new input (`begin`) continues. The robot enforces the same by the input's number.
  */
 import { batch, computed, signal, type ReadonlySignal } from "@preact/signals-core";
 import { clamp, radians } from "../../../shared/lib/angles";
 import { now } from "../../../shared/lib/clock";
 import type { KnownTelemetry } from "../../../shared/mqtt/parse-messages";
 import type { Joint, Setpoint } from "../../../shared/mqtt/protocol.generated";
+import { DelayMeter, type Delay } from "./delay-meter";
 import { zeroOf, type Velocity, type SteeringMode } from "./steerable-parts";
 
 export const PERIOD_MS = 25;
@@ -25,11 +26,16 @@ const REACHED_RAD = radians(0.2);
 /** Tolerance of the commanded position at the target [rad]. */
 const COMMANDED_RAD = radians(0.02);
 const AT_REST_RAD_S = 0.005;
+/** The robot's watchdog: without a setpoint for this long, it holds and ends the input [ms]. */
+export const WATCHDOG_MS = 300;
 /** Without motion for this long before the target, the robot is blocked and the stream ends [ms]. */
 export const STUCK_MS = 2_000;
 
 type StreamState = "idle" | "streaming" | "waiting";
-export type EndedBecause = "reached" | "stuck" | "released" | "stopped" | "hidden" | "no-telemetry" | "busy" | "no-connection" | null;
+export type EndedBecause = "reached" | "paused" | "stuck" | "released" | "stopped" | "hidden" | "no-telemetry" | "busy" | "no-connection" | null;
+
+/** These ends also end the operator's input. */
+const ENDS_INPUT: readonly EndedBecause[] = ["paused", "stopped", "hidden", "no-telemetry", "busy", "no-connection"];
 
 /** Joint name → position [rad]. */
 export type Targets = Readonly<Record<string, number>>;
@@ -61,6 +67,12 @@ export class SetpointStreamer {
   readonly #ended = signal<EndedBecause>(null);
   readonly #active = signal<ActiveVelocity | null>(null);
   readonly #timer: ReturnType<typeof setInterval>;
+  readonly #delays = new DelayMeter();
+  readonly #warning = signal<Delay | null>(null);
+  readonly #pause = signal<Delay | null>(null);
+  #input = 0;
+  #inputEnded = false;
+  #tickedAt = now();
   #sequence = 0;
   #sending = 0;
   #startedAt = 0;
@@ -71,6 +83,10 @@ export class SetpointStreamer {
   readonly state: ReadonlySignal<StreamState> = this.#state;
   /** Why the last stream ended. */
   readonly ended: ReadonlySignal<EndedBecause> = this.#ended;
+  /** The present delay of an active stream, before it causes a pause; `null`: none. */
+  readonly warning: ReadonlySignal<Delay | null> = this.#warning;
+  /** The measured cause of the pause, if `ended` is "paused". */
+  readonly pause: ReadonlySignal<Delay | null> = this.#pause;
   /** The active stream; `null`: none. */
   readonly steeringMode = computed<SteeringMode | null>(() => {
     if (this.#state.value === "idle") return null;
@@ -93,17 +109,26 @@ export class SetpointStreamer {
   /** At rest, targets follow the commanded positions, so that a small step stays small. */
   follow(): void {
     const latest = this.#options.telemetry();
+    if (latest !== null) this.#delays.receive(latest.message, latest.receivedAt);
     if (this.steeringMode.peek() === "joints" || latest === null) return;
     const next = named(this.#options.joints, latest.message.commanded_rad);
     const current = this.#targets.value;
     if (Object.entries(next).some(([name, position]) => current[name] !== position)) this.#targets.value = next;
   }
 
-  /** Sets a joint's target [rad], clamped to the joint's range. */
+  /** Starts a new input: the operator pressed a pointer, key or gamepad. */
+  begin(): void {
+    this.#input = Math.max(this.#input, this.#reportedEnd) + 1;
+    this.#inputEnded = false;
+    this.#tickedAt = now();
+  }
+
+  /** Sets a joint's target [rad], clamped to the joint's range. Without effect after the end of the input. */
   setTarget(name: string, positionRad: number): void {
     const joint = this.#options.joints.find((one) => one.name === name);
     if (joint === undefined || !Number.isFinite(positionRad)) return;
     const at = now();
+    if (!this.#continues(at)) return;
     const target = clamp(positionRad, joint.lower_rad, joint.upper_rad);
     this.#endOtherMode("joints");
     batch(() => {
@@ -126,6 +151,7 @@ export class SetpointStreamer {
       return;
     }
     const at = now();
+    if (!this.#continues(at)) return;
     this.#endOtherMode(velocity.kind);
     batch(() => {
       this.#active.value = { velocity, releasedAt: null };
@@ -144,9 +170,11 @@ export class SetpointStreamer {
 
   /** Ends the stream; targets return to the robot's positions. A velocity ends with zero velocity. */
   end(because: EndedBecause): void {
+    this.#inputEnded ||= ENDS_INPUT.includes(because);
     if (this.#state.value === "idle") return;
-    this.release();
+    if (because !== "paused") this.release();
     batch(() => {
+      this.#warning.value = null;
       this.#state.value = "idle";
       this.#ended.value = because;
       this.#active.value = null;
@@ -161,8 +189,16 @@ export class SetpointStreamer {
 
   /** One timer step. */
   tick(): void {
-    if (this.#state.value === "idle") return;
     const at = now();
+    const gap = at - this.#tickedAt;
+    this.#tickedAt = at;
+    this.#delays.tick(at);
+    if (this.#state.value === "idle") return;
+    if (gap > WATCHDOG_MS || this.#input <= this.#reportedEnd) {
+      this.#endByPause(at);
+      return;
+    }
+    this.#warn(at);
     const latest = this.#freshTelemetry(at);
     if (latest === null) {
       this.#state.value = "waiting";
@@ -177,6 +213,31 @@ export class SetpointStreamer {
     } else {
       this.#stream(message, at);
     }
+  }
+
+  /** The highest input that the robot has ended in this lease. */
+  get #reportedEnd(): number {
+    const message = this.#options.telemetry()?.message;
+    return message?.epoch === this.#options.epoch ? message.ended_input : 0;
+  }
+
+  /** Whether the current input still applies. A page that was busy for too long ends it, even at rest. */
+  #continues(at: number): boolean {
+    if (this.#input === 0) this.begin();
+    if (!this.#inputEnded && at - this.#tickedAt > WATCHDOG_MS) this.#endByPause(at);
+    return !this.#inputEnded;
+  }
+
+  #endByPause(at: number): void {
+    this.#delays.tick(at);
+    this.#pause.value = this.#delays.longest(at);
+    this.end("paused");
+  }
+
+  #warn(at: number): void {
+    const next = this.#delays.longest(at);
+    const current = this.#warning.peek();
+    if (next?.cause !== current?.cause || next?.ms !== current?.ms) this.#warning.value = next;
   }
 
   /** The newest telemetry, if an agent would still accept a setpoint that echoes it. */
@@ -222,6 +283,7 @@ export class SetpointStreamer {
     if (this.#active.value === null ? this.#reached(message, at) : this.#settled(this.#active.value, message, at)) return;
     if (this.#sending > 0) {
       // The previous setpoint is still being sent. Do not queue: the newest target is sent next.
+      this.#delays.wait(this.#sentAt, at);
       if (at - this.#sentAt > this.#timeoutMs) this.end("no-connection");
       return;
     }
@@ -240,6 +302,7 @@ export class SetpointStreamer {
       sequence: this.#sequence,
       echo_tick_ms: message.tick_ms,
       sent_ms: at,
+      input: this.#input,
       target: velocity ?? { kind: "joints", position_rad: { ...this.#targets.value } },
     };
     this.#options.send(setpoint).then(

@@ -107,7 +107,7 @@ function RobotPanel({ session, active, onSelect, onStop }: RobotPanelProps) {
           {texts.multiRobot.keysHere}
         </button>
       </header>
-      <ControlBar device={device} control={control} stop={stop} watchers={session.watchers} />
+      <ControlBar session={session} watchers={session.watchers} />
       <StopBanner device={device} stop={stop} />
       <TwinView device={device} control={control} />
       <SteeringCard session={session} active={active} onStop={onStop} />
