@@ -64,10 +64,13 @@ export function ControlBar({ session, watchers }: ControlBarProps) {
 function useAccountIds(device: DeviceStore): void {
   const holder = device.holder.value;
   const request = device.request.value;
-  const unknown = (holder !== null && !holder.mine && holder.account === "") || request?.account === "";
+  // The lease of a single action is only in the cloud.
+  const action = device.state.value?.action?.id;
+  const anonymous = holder === null ? action !== undefined : !holder.mine && holder.account === "";
+  const unknown = anonymous || request?.account === "";
   useEffect(() => {
     if (unknown) void device.refreshLease();
-  }, [device, unknown, device.state.value?.epoch, request?.id]);
+  }, [device, unknown, device.state.value?.epoch, request?.id, action]);
 }
 
 /** Whether another operator has control, so that this page must request it. */

@@ -350,6 +350,7 @@ describe("a gap in the setpoints", () => {
     expect(robot.position[0]).toBeCloseTo(0.7);
     const count = robot.sent.length;
     freeze(2_000);
+    robot.measure();
     streamer.setTarget("a", 1.9);
     expect(robot.sent).toHaveLength(count);
     freeze(2_000);

@@ -128,7 +128,7 @@ export class SetpointStreamer {
     const joint = this.#options.joints.find((one) => one.name === name);
     if (joint === undefined || !Number.isFinite(positionRad)) return;
     const at = now();
-    if (!this.#continues(at)) return;
+    if (!this.#continues) return;
     const target = clamp(positionRad, joint.lower_rad, joint.upper_rad);
     this.#endOtherMode("joints");
     batch(() => {
@@ -151,7 +151,7 @@ export class SetpointStreamer {
       return;
     }
     const at = now();
-    if (!this.#continues(at)) return;
+    if (!this.#continues) return;
     this.#endOtherMode(velocity.kind);
     batch(() => {
       this.#active.value = { velocity, releasedAt: null };
@@ -194,6 +194,7 @@ export class SetpointStreamer {
     this.#tickedAt = at;
     this.#delays.tick(at);
     if (this.#state.value === "idle") return;
+    // A page that was busy for too long ends its input, also if the robot rested meanwhile.
     if (gap > WATCHDOG_MS || this.#input <= this.#reportedEnd) {
       this.#endByPause(at);
       return;
@@ -221,15 +222,13 @@ export class SetpointStreamer {
     return message?.epoch === this.#options.epoch ? message.ended_input : 0;
   }
 
-  /** Whether the current input still applies. A page that was busy for too long ends it, even at rest. */
-  #continues(at: number): boolean {
+  /** Whether the current input still applies. */
+  get #continues(): boolean {
     if (this.#input === 0) this.begin();
-    if (!this.#inputEnded && at - this.#tickedAt > WATCHDOG_MS) this.#endByPause(at);
     return !this.#inputEnded;
   }
 
   #endByPause(at: number): void {
-    this.#delays.tick(at);
     this.#pause.value = this.#delays.longest(at);
     this.end("paused");
   }
