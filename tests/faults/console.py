@@ -1,8 +1,10 @@
-"""An operator without a browser: takes control and streams setpoints by the rules of the console.
+"""An operator without a browser: takes control and streams setpoints by the rules of the console, with one exception.
+
+It continues its input after a gap, which the console does not, because the agent must refuse that by itself.
 
 ``python -m tests.faults.console`` is a warm parent process. For each ``OperatorConfig`` (a line of JSON) it forks an
-operator and prints the process id. An operator receives the requests ``take``, ``sweep`` and ``rest`` over its Unix
-socket, and sends the events ``granted``, ``moving``, ``lost`` and ``ended``.
+operator and prints the process id. An operator receives the requests ``take``, ``sweep``, ``rest`` and ``status`` over
+its Unix socket, and sends the events ``granted``, ``moving``, ``lost`` and ``ended``, and its status.
 """
 
 import contextlib
@@ -45,7 +47,7 @@ class OperatorConfig(msgspec.Struct):
         mqtt_port: Port of the broker.
         device: Id of the device.
         joint: Index of the joint that it moves, between ``low_rad`` and ``high_rad``.
-        stubborn: Whether it streams on after its lease has expired, like a page with a wrong clock.
+        stubborn: Whether it streams on after its lease has expired, and after any gap, like a page with a wrong clock.
     """
 
     socket: str
@@ -142,7 +144,7 @@ class Operator:
         self._sweeping = False
         self._motion_reported = True
         self._key = b""
-        self._sequence = 0
+        self._sequence = self._input = 0
         self._target_rad: list[float] = []
         self._sent_s = 0.0
 
@@ -181,7 +183,7 @@ class Operator:
             return
         epoch = self.epoch = granted["epoch"]
         self._key = bytes.fromhex(granted["setpoint_key"])
-        self._confirmed, self._sequence, self._sweeping = False, 0, False
+        self._confirmed, self._sequence, self._input, self._sweeping = False, 0, 0, False
         self._renewed(granted, requested_s)
         self._link = Link(
             self.config,
@@ -191,11 +193,12 @@ class Operator:
         self._report(granted=epoch, confirmed=granted["confirmed"])
 
     def sweep(self) -> None:
-        """Sweep the slider between both ends."""
+        """Press the slider and sweep it between both ends."""
         telemetry = self._telemetry
         if self.epoch is None or telemetry is None:
             self._report(ended="no-telemetry")
             return
+        self._input += 1
         self._target_rad = list(telemetry[0].commanded_rad)
         self._turn()
         self._sent_s = time.monotonic()
@@ -204,6 +207,12 @@ class Operator:
     def rest(self) -> None:
         """Release the slider."""
         self._sweeping = False
+
+    def status(self) -> None:
+        """Report the lease and whether the agent has ended the input."""
+        message = self._telemetry[0] if self._telemetry else None
+        ended = message is not None and message.epoch == self.epoch and message.ended_input >= self._input
+        self._report(epoch=self.epoch, input_ended=ended)
 
     # ------------------------------------------------------------ the page's rules
 
@@ -231,7 +240,12 @@ class Operator:
         self._sequence += 1
         target = JointTarget(position_rad=dict(zip(self.config.joints, self._target_rad, strict=True)))
         setpoint = Setpoint(
-            epoch=self.epoch, sequence=self._sequence, echo_tick_ms=message.tick_ms, sent_ms=now_s * 1000, target=target
+            epoch=self.epoch,
+            sequence=self._sequence,
+            echo_tick_ms=message.tick_ms,
+            sent_ms=now_s * 1000,
+            target=target,
+            input=self._input,
         )
         topic = f"{self.config.topic}/ctl/{self.epoch}"
         sealed = setpoints.seal(codec.encode(setpoint), self._key, topic)
@@ -293,6 +307,8 @@ class Operator:
             self._report(lost=reason)
 
     def _end(self, reason: str) -> None:
+        if self.config.stubborn:
+            return
         self._sweeping = False
         self._report(ended=reason)
 

@@ -142,6 +142,12 @@ class Arm:
             time.sleep(0.1)
         else:
             raise AssertionError(f"{self.name}: no control within {PATIENCE_S} s")
+        return self.sweep()
+
+    def sweep(self) -> bool:
+        """Start a new input that sweeps. Returns True if the arm moves."""
+        console = self.console
+        assert console is not None
         for _ in range(20):
             console.send("sweep")
             message = console.receive("moving", "lost", "ended", within_s=3)
@@ -174,6 +180,30 @@ class Arm:
         setpoints_ms = self.stack.setpoints[self.name]
         self.stack.setpoints[self.name] = setpoints_ms[-200:]
         return max((at_ms for at_ms in setpoints_ms if at_ms <= cut_ms + _MAX_SETPOINT_AGE_MS), default=cut_ms)
+
+
+def cut_operator(arm: Arm, cut: str) -> Repair:
+    """Interrupt the operator of an arm. Returns the repair."""
+    console = arm.console
+    assert console is not None
+    match cut:
+        case "console killed":
+            console.signal(signal.SIGKILL)
+            return arm.close_console
+        case "console stopped":
+            console.signal(signal.SIGSTOP)
+            return lambda: console.signal(signal.SIGCONT)
+        case "operator disconnected":
+            console.proxy.cut()
+            console.proxy.freeze()
+            return console.proxy.thaw
+        case "operator's link stalls":
+            console.proxy.freeze()
+            return console.proxy.thaw
+        case "operator's link dropped":
+            console.proxy.swallow()
+            return arm.close_console
+    raise AssertionError(cut)
 
 
 class Bench:
@@ -223,26 +253,7 @@ class Bench:
         return Result(cut, arm.name, arm.verdict(cut, cut_ms, arm.last_setpoint_ms(cut_ms)))
 
     def _cut_operator(self, arm: Arm, cut: str) -> Repair:
-        console = arm.console
-        assert console is not None
-        match cut:
-            case "console killed":
-                console.signal(signal.SIGKILL)
-                return arm.close_console
-            case "console stopped":
-                console.signal(signal.SIGSTOP)
-                return lambda: console.signal(signal.SIGCONT)
-            case "operator disconnected":
-                console.proxy.cut()
-                console.proxy.freeze()
-                return console.proxy.thaw
-            case "operator's link stalls":
-                console.proxy.freeze()
-                return console.proxy.thaw
-            case "operator's link dropped":
-                console.proxy.swallow()
-                return arm.close_console
-        raise AssertionError(cut)
+        return cut_operator(arm, cut)
 
     def _round_of_all(self, cut: str) -> list[Result]:
         functions, script = cut.startswith("functions"), cut in SCRIPT

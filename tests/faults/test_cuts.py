@@ -5,6 +5,7 @@ import random
 import pytest
 
 from tests.faults.cuts import OPERATOR, SCRIPT, SHARED, Bench, Tally
+from tests.faults.gaps import inject, table
 from tests.faults.judge import Row, judge
 from tests.faults.stack import start
 from tests.harness.network.brokers import BROKERS, BrokerKind
@@ -51,6 +52,15 @@ def test_a_moving_arm_rests_in_time_after_a_thousand_cuts(kind: BrokerKind) -> N
     assert not tally.broken
     assert not tally.late, "run this test on an idle machine; late results are failures"
     assert tally.count >= 500
+
+
+@pytest.mark.parametrize("count", [6, pytest.param(200, marks=[pytest.mark.long, pytest.mark.timeout(1800)])])
+def test_an_arm_rests_in_each_gap_and_only_a_new_input_moves_it_under_the_same_lease(count: int) -> None:
+    with start("mosquitto", 3) as stack:
+        gaps = inject(stack, count, seed=7)
+    print(table(gaps))
+    assert [gap for gap in gaps if gap.broken] == []
+    assert sum(gap.held for gap in gaps) > 0.8 * count
 
 
 @pytest.mark.long
