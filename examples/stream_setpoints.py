@@ -1,7 +1,8 @@
 """Move one joint with streamed setpoints. Usage: ``python examples/stream_setpoints.py DEVICE JOINT POSITION_RAD``.
 
 Takes the lease, streams authenticated setpoints that echo the newest telemetry tick, and releases the lease. The robot
-stops automatically 300 ms after the last setpoint.
+stops automatically 300 ms after the last setpoint. Then it accepts only a higher ``input``. Only a person should decide
+to continue, so this program ends.
 """
 
 import hmac
@@ -15,6 +16,7 @@ from telescope_client import call, connect_to_broker, find_device, topic
 PERIOD_S = 0.025
 TIMEOUT_S = 20.0
 TOLERANCE_RAD = 0.02
+INPUT = 1
 
 name, joint, position = sys.argv[1:]
 target_rad = float(position)
@@ -55,12 +57,16 @@ try:
         if abs(message["position_rad"][joints.index(joint)] - target_rad) < TOLERANCE_RAD:
             print(f"{joint} reached {target_rad} rad; loop age {message['loop_age_ms']:.0f} ms")
             break
+        ended_input = message.get("ended_input", 0)
+        if message["epoch"] == lease["epoch"] and ended_input >= INPUT:
+            sys.exit("setpoints arrived too late, so the robot holds; start again to continue")
         sequence += 1
         setpoint = {
             "epoch": lease["epoch"],
             "sequence": sequence,
             "echo_tick_ms": message["tick_ms"],
             "sent_ms": time.time() * 1000,
+            "input": INPUT,
             "target": {"kind": "joints", "position_rad": {joint: target_rad}},
         }
         control.publish(ctl, seal(setpoint), qos=0)
