@@ -33,9 +33,9 @@ export const texts = {
       "released": "",
       stopped: "Ended: the robot is stopped",
       hidden: "Ended: the page was not visible",
-      "no-telemetry": "Ended: no recent telemetry from the robot. Move the slider again to continue.",
+      "no-telemetry": "Ended: no recent telemetry from the robot. Release the control and press it again to continue.",
       busy: "Ended: an action is running",
-      "no-connection": "Ended: no connection for setpoints. Move the slider again to continue.",
+      "no-connection": "Ended: no connection for setpoints. Release the control and press it again to continue.",
     } satisfies Record<Exclude<EndedBecause, "paused" | null>, string>,
   },
 
