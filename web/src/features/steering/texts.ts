@@ -23,7 +23,7 @@ export const texts = {
     busy: "An action is running.",
     stopped: "The robot is stopped.",
     limited: (limits: string): string => `Limited by the robot: ${limits}`,
-    warning: ({ cause, ms }: Delay): string => `Slow: ${CAUSES[cause]} (${ms} ms). The robot pauses after ${WATCHDOG_MS} ms.`,
+    warning: ({ cause, ms }: Delay): string => `Slow: ${CAUSES[cause]} (${ms} ms). The robot stops within ${WATCHDOG_MS} ms without a setpoint.`,
     paused: (delay: Delay | null): string =>
       `Paused: no setpoint for ${delay === null ? `${WATCHDOG_MS} ms` : `${delay.ms} ms (${CAUSES[delay.cause]})`}. Release the control and press it again to continue.`,
     noDescription: "Waiting for the robot's description…",
