@@ -21,7 +21,8 @@ class CloudClock:
     """The cloud's wall clock, estimated on the agent's monotonic clock. Thread-safe.
 
     Each HTTP response contains the server's time. Half the round trip bounds the error, and the estimate with the
-    smallest bound is used. Changes of the agent's own wall clock have no effect.
+    smallest bound is used. An exchange that contradicts the estimate replaces it: the cloud's clock was set. Changes of
+    the agent's own wall clock have no effect.
     """
 
     def __init__(self) -> None:
@@ -36,7 +37,7 @@ class CloudClock:
         offset = server_ms - (sent_tick_ms + received_tick_ms) / 2
         with self._lock:
             aged = self._error_ms + (received_tick_ms - self._measured_ms) * _DRIFT
-            if error <= aged:
+            if error <= aged or abs(offset - self._offset_ms) > error + aged:
                 self._offset_ms, self._error_ms, self._measured_ms = offset, error, int(received_tick_ms)
 
     def now_ms(self) -> float | None:
