@@ -1,0 +1,1 @@
+"""Virtual time, simulated threads and disks, and random numbers from one seed."""

@@ -1,0 +1,1 @@
+"""The simulated network, MQTT broker and connections."""
