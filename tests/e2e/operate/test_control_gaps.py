@@ -118,7 +118,7 @@ def test_a_repeated_key_does_not_continue_after_a_gap(browser: Browser, machine:
 
 
 def drag_often(page: Page, machine: Machine, count: int) -> Counter[str]:
-    """Drag the elbow this many times; control must remain, whatever happens to the setpoints."""
+    """Drag the elbow this many times; control must remain, also when setpoints are late."""
     trace = machine.trace()
     outcomes = Counter[str]()
     take_control(page)
