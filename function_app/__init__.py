@@ -7,6 +7,7 @@ access, so that other programs do not pay for the import.
 import gc
 from typing import Any
 
+VERSION = "0.1.0"
 _AZURE = "app"
 _LOOK_AFTER = 20_000
 """The collector looks for cycles after so many new objects, not 700: imports make hundreds of thousands that all stay,

@@ -2,7 +2,9 @@
 
 from functools import cached_property
 
+from function_app import VERSION
 from function_app.bootstrap.accounts import AccountServices
+from function_app.services.maintenance.heartbeats import Heartbeats
 from function_app.services.maintenance.readiness import ReadinessCheck
 from function_app.services.maintenance.restored_backup import RestoredBackup
 from function_app.services.maintenance.scheduler import Scheduler
@@ -51,5 +53,18 @@ class MaintenanceServices(AccountServices):
         )
 
     @cached_property
+    def heartbeats(self) -> Heartbeats:
+        return Heartbeats(tables=self.tables, clock=self.clock, version=VERSION)
+
+    @cached_property
     def health(self) -> ReadinessCheck:
-        return ReadinessCheck(tables=self.tables, bus=self.bus)
+        return ReadinessCheck(
+            tables=self.tables,
+            blobs=self.blobs,
+            bus=self.bus,
+            heartbeats=self.heartbeats,
+            free_bytes=self.adapters.free_bytes,
+            min_free_bytes=self.quota.limits.min_free_bytes,
+            subscribes=self.settings.bus is None,
+            clock=self.clock,
+        )

@@ -7,10 +7,12 @@ from pathlib import Path
 
 from device_agent.protocol.manifests.shipped import ROBOTS
 from function_app.settings.access import (
+    Administration,
     ConnectionSettings,
     OidcClient,
     RateLimits,
     Tls,
+    read_administration,
     read_connections,
     read_oidc,
     read_rate_limits,
@@ -34,6 +36,7 @@ from function_app.settings.storage import (
 __all__ = [
     "CONSOLE",
     "ROOT",
+    "Administration",
     "AwsStore",
     "AzureStore",
     "ConnectionSettings",
@@ -101,6 +104,7 @@ class Settings:
     robots: Path = ROBOTS
     console: Path = CONSOLE
     trusted_proxies: int = 0
+    administration: Administration = field(default_factory=Administration)
     connections: ConnectionSettings = field(default_factory=ConnectionSettings)
     allow_unconfined_models: bool = False
     rate_limits: RateLimits = field(default_factory=RateLimits)
@@ -143,6 +147,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         robots=env.folder("TELESCOPE_ROBOTS", ROBOTS),
         console=env.folder("TELESCOPE_CONSOLE", CONSOLE),
         trusted_proxies=env.number("TELESCOPE_TRUSTED_PROXIES", 0, 0, 10),
+        administration=read_administration(env),
         connections=read_connections(env),
         allow_unconfined_models=env.number("TELESCOPE_ALLOW_UNCONFINED_MODELS", 0, 0, 1) == 1,
         rate_limits=read_rate_limits(env),

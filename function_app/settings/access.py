@@ -5,11 +5,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from function_app.domain.identity.accounts import fold_name
 from function_app.settings.environment import Environment, SettingsError
 
 _CLIENT_ID = re.compile(r"\A[!-~]{1,255}\Z")
 _PROVIDER = re.compile(r"\A[^\x00-\x1f\x7f]{1,60}\Z")
 _HOST_NAMES = re.compile(r"\A[A-Za-z0-9._:\[\], -]{0,2000}\Z")
+_TOKEN = re.compile(r"\A([!-~]{16,255})?\Z")
 _LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 
 
@@ -57,6 +59,19 @@ class RateLimits:
     account: int = 100
     key: int = 20
     agent: int = 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Administration:
+    """Access to the state of the installation.
+
+    Attributes:
+        accounts: Folded names of the accounts that may read it.
+        metrics_token: Bearer token of a monitoring system; empty: only loopback addresses may read the metrics.
+    """
+
+    accounts: frozenset[str] = frozenset()
+    metrics_token: str = field(default="", repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,3 +151,12 @@ def read_oidc(env: Environment) -> OidcClient | None:
         name=env.matching("TELESCOPE_OIDC_NAME", parts.hostname or "", _PROVIDER, "a name of at most 60 characters"),
         anyone=accounts == "anyone",
     )
+
+
+def read_administration(env: Environment) -> Administration:
+    """Administrators, and the token of the metrics."""
+    name = "TELESCOPE_METRICS_TOKEN"
+    if not _TOKEN.match(env.get(name)):  # the message must not contain it
+        raise SettingsError(f"{name} is invalid; it must be 16 to 255 characters without spaces")
+    accounts = (fold_name(account) for account in env.get("TELESCOPE_ADMINISTRATORS").split(","))
+    return Administration(accounts=frozenset(filter(None, accounts)), metrics_token=env.get(name))

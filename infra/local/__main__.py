@@ -22,7 +22,6 @@ from infra.local.supervisor import StartError, SupervisedProcess
 
 _NEEDS = ("fastapi", "uvicorn", "msgspec", "jwt", "paho", "amqtt", "mujoco", "ruckig", "requests", "numpy")
 _START_TIMEOUT_S = 60.0
-_ACCOUNT = "demo"
 _ARM = ("--device", "ur5=ur5")
 
 
@@ -173,7 +172,8 @@ class LocalStack:
         return result.stdout
 
     def _sign_in_link(self) -> str:
-        return self._run_once("-m", "function_app", "sign-in-link", "--account", _ACCOUNT).strip().splitlines()[-1]
+        output = self._run_once("-m", "function_app", "sign-in-link", "--account", settings.ACCOUNT)
+        return output.strip().splitlines()[-1]
 
     def _await_health(self) -> None:
         deadline_s = time.monotonic() + _START_TIMEOUT_S

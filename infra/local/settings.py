@@ -9,6 +9,8 @@ from typing import Literal, cast
 
 from infra import files
 
+ACCOUNT = "demo"
+"""The account of the first sign-in link; it is the administrator unless the environment names others."""
 XMPP_DOMAIN = "telescope.localhost"
 """Domain of a single machine; not resolvable."""
 ROOMS = Path(__file__).resolve().parents[2] / "robots" / "rooms"
@@ -91,6 +93,7 @@ class Settings:
             "TELESCOPE_MQTT_PORT": str(self.mqtt_port),
             "TELESCOPE_WEBSOCKET_PORT": str(self.websocket_port),
             "TELESCOPE_BROKER": self.broker,
+            "TELESCOPE_ADMINISTRATORS": os.environ.get("TELESCOPE_ADMINISTRATORS", ACCOUNT),
             "TELESCOPE_XMPP_DOMAIN": XMPP_DOMAIN if self.xmpp else "",
             "TELESCOPE_XMPP_HOST": self.host,
             "TELESCOPE_XMPP_PORT": str(self.xmpp_port),

@@ -189,6 +189,7 @@ class SqliteTables:
 
     def _read(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
         db = self._db or self._open()
+        self._require_same_file()
         with self._reporting():
             return db.execute(statement, values).fetchall()
 

@@ -20,6 +20,8 @@ _SCHEDULES = frozenset({"aws.events", "aws.scheduler"})
 """Sources of timer events from EventBridge rules and schedules without custom input."""
 _TEXT = ("text/", "application/json", "application/problem+json", "application/javascript", "image/svg+xml")
 """Content types that are returned as text; the gateway requires base64 for all others."""
+_TIMER_MS = 60_000
+"""Shortest period of an EventBridge schedule [ms]."""
 _MAX_LOGGED = 200
 
 
@@ -39,8 +41,13 @@ def handler(event: dict[str, Any], context: Any) -> Any:
     if "topic" in event:
         return loop.run_until_complete(from_iot_rule(_functions(), event))
     if event.get("source") in _SCHEDULES:
-        return loop.run_until_complete(_functions().scheduler.run_due_jobs())
+        return loop.run_until_complete(_run_timer())
     raise ValueError(f"unknown event with the fields {str(sorted(event))[:_MAX_LOGGED]}")
+
+
+async def _run_timer() -> None:
+    await _functions().scheduler.run_due_jobs()
+    await _functions().heartbeats.timer_ran(period_ms=_TIMER_MS)
 
 
 @functools.cache

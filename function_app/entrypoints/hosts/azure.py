@@ -15,6 +15,7 @@ from function_app.entrypoints.http import create_app
 from function_app.entrypoints.ingest.cloud_events import from_event_grid
 
 app = func.FunctionApp(http_auth_level=func.AuthLevel.ANONYMOUS)
+_TIMER_MS = 5_000
 _METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "HEAD", "OPTIONS")
 
 
@@ -51,6 +52,7 @@ async def http(req: func.HttpRequest, context: func.Context) -> func.HttpRespons
 async def sweep(timer: func.TimerRequest) -> None:  # noqa: ARG001 (the host passes it by name)
     """Run due jobs: republished commands, ended actions, expired permissions."""
     await _functions().scheduler.run_due_jobs()
+    await _functions().heartbeats.timer_ran(period_ms=_TIMER_MS)
 
 
 @app.function_name("ingest")

@@ -9,6 +9,7 @@ import function_app
 from function_app.bootstrap import Functions
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from function_app.ports.model_compiler import CompilerMissingError
+from function_app.services.maintenance.heartbeats import JOBS
 
 SWEEP_EVERY_S = 1.0
 CHECK_EVERY_S = 0.2
@@ -38,7 +39,9 @@ async def work(functions: Functions) -> None:
         await functions.confirmations.publish(messages)
 
     function_app.run_for_long()
+    functions.heartbeats.expect(JOBS)
     tasks = [
+        asyncio.create_task(functions.heartbeats.run()),
         asyncio.create_task(functions.feed.run(handle)),
         asyncio.create_task(functions.telemetry.run(handle_telemetry)),
         asyncio.create_task(functions.late.run(handle_telemetry)),
@@ -92,6 +95,7 @@ async def _sweep(functions: Functions) -> None:
         ran_s = loop.time()
         try:
             await functions.scheduler.run_due_jobs(current=ran_s >= current_s)
+            functions.heartbeats.ran(JOBS)
         except Exception:  # noqa: BLE001 (the timer continues after a failed run)
             _log.exception("timer")
         await asyncio.sleep(SWEEP_EVERY_S)

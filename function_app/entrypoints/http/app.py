@@ -1,5 +1,6 @@
 """The HTTP application: API routes, error responses, security headers, and the console."""
 
+import asyncio
 import logging
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
@@ -14,6 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from function_app import VERSION
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem, invalid, store_unavailable
 from function_app.entrypoints.http.accounts import api_keys, audit, auth, me, oidc, second_factor
@@ -31,7 +33,6 @@ from function_app.entrypoints.http.framework.routing import (
     AGENT_SCHEME,
     KEY_SCHEME,
     PREFIX,
-    VERSION,
     Routes,
     schemas,
 )
@@ -73,7 +74,10 @@ def create_app(functions: Functions) -> FastAPI:
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         # Only shortens the first request: some hosts do not run the lifespan.
         await functions.bus.start()
+        watching = asyncio.create_task(functions.health.watch())
         yield
+        watching.cancel()
+        await asyncio.gather(watching, return_exceptions=True)
         await functions.close()
 
     app = FastAPI(

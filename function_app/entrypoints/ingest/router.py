@@ -22,7 +22,9 @@ async def ingest(functions: Functions, topic: str, payload: bytes) -> None:
         Problem, StoreError: The message is not stored; it must be delivered again.
     """
     try:
-        await store_message(functions, topics.parse(topic), payload)
+        parsed = topics.parse(topic)
+        if not functions.heartbeats.observe(parsed, payload):
+            await store_message(functions, parsed, payload)
     except ProtocolError as error:
         _log.warning("dropped a message on %s: %s", topic[:_MAX_LOGGED], error)
 

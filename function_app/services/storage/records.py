@@ -74,6 +74,8 @@ AUDIT = "Audit"
 ``chains``, which lists them. See ``services/audit/audit_log.py``."""
 FORGET = "Forget"
 """Partition: shard; key: ``<due ms>:<hash of the target>``."""
+WORKERS = "Workers"
+"""Partition ``workers``: key: name of a worker. Partition ``probes``: key: name of a host, written by its server."""
 MAILBOX = "Mailbox"
 """Partition: agent id; keys ``<0 for Stop, 1>:<oldest first>:<command id>``, ``ack:<command id>``."""
 

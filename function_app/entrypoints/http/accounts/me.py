@@ -5,6 +5,7 @@ from fastapi import Request, Response
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.accounts import schemas
+from function_app.entrypoints.http.framework.administration import is_administrator
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, bearer
 from function_app.entrypoints.http.framework.responses import empty, json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
@@ -26,7 +27,12 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             devices=usage.device_bytes,
         )
         body = schemas.AccountOut(
-            id=caller.account, name=caller.name, session=caller.session, csrf_token=csrf, storage=storage
+            id=caller.account,
+            name=caller.name,
+            session=caller.session,
+            csrf_token=csrf,
+            administrator=is_administrator(caller, functions.settings.administration),
+            storage=storage,
         )
         return json_response(body, headers={"Cache-Control": "no-store"})
 

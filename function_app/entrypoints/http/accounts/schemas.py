@@ -147,12 +147,16 @@ class StorageOut(Response, frozen=True, kw_only=True):
 
 
 class AccountOut(Response, frozen=True, kw_only=True):
-    """The signed-in account. ``csrf_token`` is required in requests with the cookie; null for a bearer token."""
+    """The signed-in account. ``csrf_token`` is required in requests with the cookie; null for a bearer token.
+
+    ``administrator``: may read the state of the server.
+    """
 
     id: str
     name: str
     session: str
     csrf_token: str | None
+    administrator: bool
     storage: StorageOut
 
 

@@ -15,7 +15,6 @@ Handler = Callable[..., Awaitable[Response]]
 Caller = Literal["anonymous", "account", "page", "agent", "account or agent"]
 
 PREFIX = "/api/v1"
-VERSION = "0.1.0"
 Cursor = Annotated[str | None, Query(max_length=2000, description="Cursor of the previous page.")]
 Since = Annotated[
     int | None,

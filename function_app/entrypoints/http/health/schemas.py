@@ -2,6 +2,7 @@
 
 from typing import Literal
 
+from function_app.domain.health.server_health import Status
 from function_app.entrypoints.http.framework.schemas import Moment, Response
 
 
@@ -129,11 +130,39 @@ class DeviceHealthList(Response, frozen=True, kw_only=True):
     cursor: str | None
 
 
+class PartOut(Response, frozen=True, kw_only=True):
+    """One part of the server. ``message``: the cause and the remedy, or a figure. ``since``: start of the status."""
+
+    name: str
+    status: Status
+    message: str
+    since: Moment
+
+
+class LiveOut(Response, frozen=True, kw_only=True):
+    """The process answers."""
+
+    status: Literal["ok"]
+
+
+class ReadyOut(Response, frozen=True, kw_only=True):
+    """The worst status of a part. ``parts``: for administrators and the metrics token."""
+
+    status: Literal["ok", "degraded"]
+    parts: tuple[PartOut, ...] | None
+
+
 class HealthOut(Response, frozen=True, kw_only=True):
-    """Health of the server. ``tables``, ``broker``, and the check of ``models``: ``ok``, or the error."""
+    """Health of the server.
+
+    Attributes:
+        tables, broker, models: ``ok``, or the error; without sign-in, ``failed``.
+        parts: For administrators and the metrics token.
+    """
 
     status: Literal["ok", "degraded"]
     version: str
     tables: str
     broker: str
     models: str
+    parts: tuple[PartOut, ...] | None

@@ -14,6 +14,7 @@ from starlette.types import Scope
 from function_app.domain.common.problems import Problem
 from function_app.entrypoints.http.framework.responses import MAX_BODY
 from function_app.entrypoints.http.framework.responses import problem as problem_response
+from function_app.settings import Administration
 from tests.fakes.clock import MovingClock
 from tests.harness.cloud.cloud import API, Cloud, Person, problem
 from tests.harness.cloud.cloud import settings as cloud_settings
@@ -134,7 +135,8 @@ class TestErrors:
         assert response.headers["x-content-type-options"] == "nosniff"
 
     def test_unavailable_tables_are_503_and_reported_by_the_health_check(self, tmp_path: Path) -> None:
-        with Cloud(cloud_settings(tmp_path)) as cloud:
+        administration = Administration(metrics_token="a-token-of-the-monitoring")
+        with Cloud(cloud_settings(tmp_path, administration=administration)) as cloud:
             anna = cloud.sign_in("anna")
             cloud.run(cloud.functions.tables.close())
             (tmp_path / "tables.sqlite").write_bytes(b"no database " * 100)
@@ -144,7 +146,9 @@ class TestErrors:
             problem(response, 503, "store-unavailable")
             assert response.headers["retry-after"]
             assert str(tmp_path) not in response.text
-            assert "damaged" in problem(cloud.request("GET", f"{API}/health"), 503, "store-unavailable")["detail"]
+            for headers, shown in (({}, False), ({"Authorization": "Bearer a-token-of-the-monitoring"}, True)):
+                answer = cloud.request("GET", f"{API}/health", headers=headers)
+                assert ("damaged" in problem(answer, 503, "store-unavailable")["detail"]) is shown
 
     def test_a_problem_has_its_extra_members_and_retry_after(self) -> None:
         response = problem_response(Problem("x", 429, "T", "D.", retry_after_s=7, extras={"holder": "anna"}))
