@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -42,6 +43,9 @@ from device_agent.transports.http.client import CloudClient
 from device_agent.transports.http.latency_reports import LatencyReports
 from device_agent.transports.http.uploads import HttpUploads
 from device_agent.transports.pairing_monitor import PairingMonitor
+
+if TYPE_CHECKING:
+    from device_agent.transports.metrics import AgentMetrics  # its package is optional
 
 
 @dataclass(eq=False, slots=True)
@@ -223,12 +227,10 @@ def cloud_client(
     )
 
 
-def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
-    """Build an agent, ready to start.
+def build(store: IdentityStore, *, trace: Path | None = None, metrics: "AgentMetrics | None" = None) -> RunningAgent:
+    """Build the agent of an enrolled and claimed ``store``, ready to start; ``metrics`` measures it.
 
-    Args:
-        store: An enrolled and claimed agent.
-        trace: Folder for the ground truth of simulated devices, ``{device}.ndjson`` each.
+    ``trace``: folder for the ground truth of simulated devices, ``{device}.ndjson`` each.
 
     Raises:
         ConfigError: The agent is not enrolled or claimed, or a file is wrong.
@@ -265,13 +267,17 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
         listen=readings.topics(),
     )
     latencies = LatencyReports(pairing.agent, _transport_name(configuration), wiring.open_api)
+    link = factory.make(wiring)
     transport = LatencyProbe(
-        factory.make(wiring), upload=latencies.send, at_ms=lambda: round(clock.now_ms() or wall_ms())
+        link if metrics is None else metrics.measured(link),
+        upload=latencies.send,
+        at_ms=lambda: round(clock.now_ms() or wall_ms()),
     )
     outbox = _outbox(store, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
     sandbox = SandboxHost(allow_unconfined=configuration.allow_unconfined_scripts)
     uploads = HttpUploads(pairing.agent, lambda: cloud_client(store, configuration, clock))
-    load, supervisor = LoadGovernor(), Supervisor()
+    load = LoadGovernor() if metrics is None else metrics.load
+    supervisor = Supervisor()
     devices: dict[str, Device] = {}
     neighbours: dict[str, RoomDriver] = {}
     for entry in configuration.devices:
@@ -297,6 +303,8 @@ def build(store: IdentityStore, *, trace: Path | None = None) -> RunningAgent:
             supervisor=supervisor,
             streaming=configuration.transport != "http",
         )
+    if metrics is not None:
+        metrics.read_from(devices, outbox)
     agent = Agent(devices, transport, outbox=outbox, readings=readings, address=(pairing.space, pairing.agent))
     return RunningAgent(agent, journal, monitor, sandbox, supervisor)
 

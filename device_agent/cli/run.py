@@ -8,15 +8,20 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from device_agent import bootstrap
 from device_agent.cli import robot_types, systemd
 from device_agent.cli.arguments import Commands, add_home, add_no_qr
 from device_agent.cli.enroll import announce, await_claim
 from device_agent.config.agent_config import AgentConfig
+from device_agent.config.errors import ConfigError
 from device_agent.config.identity_store import IdentityStore
 from device_agent.ports.clock import CloudClock
 from device_agent.runtime.supervision import CHECK_PERIOD_S
+
+if TYPE_CHECKING:
+    from device_agent.transports.metrics import AgentMetrics
 
 EXIT_FAILED = 70
 """Exit code after an essential thread has ended or hung, so that the service manager restarts the agent."""
@@ -35,6 +40,7 @@ def add_commands(commands: Commands, home: Path) -> None:
     parser.add_argument(
         "--trace", type=Path, metavar="FOLDER", help="folder in which simulated devices record their ground truth"
     )
+    parser.add_argument("--metrics", type=int, metavar="PORT", help="serve metrics at this port of 127.0.0.1")
     add_no_qr(parser)
     add_home(parser, home)
     parser.set_defaults(command=_run)
@@ -48,7 +54,8 @@ def _run(options: argparse.Namespace) -> int:
         if options.trace is not None:
             options.trace.mkdir(parents=True, exist_ok=True)
         robot_types.update(store)
-        while (code := _run_until_unpaired(store, options.trace)) is None:
+        metrics = None if options.metrics is None else _serve_metrics(options.metrics)
+        while (code := _run_until_unpaired(store, options.trace, metrics)) is None:
             _pair(store, qr=not options.no_qr)
             robot_types.update(store)
     return code
@@ -81,11 +88,27 @@ def _exit(*_: object) -> None:
     raise SystemExit(0)
 
 
-def _run_until_unpaired(store: IdentityStore, trace: Path | None) -> int | None:
+def _serve_metrics(port: int) -> "AgentMetrics":
+    """Start to serve metrics.
+
+    Raises:
+        ConfigError: The package is missing, or the port is in use.
+    """
+    try:
+        from device_agent.transports.metrics import AgentMetrics  # noqa: PLC0415 (optional)
+
+        return AgentMetrics.serve(port)
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"--metrics needs the Python package {error.name}") from error
+    except OSError as error:
+        raise ConfigError(f"--metrics {port}: {error.strerror}; choose a free port") from error
+
+
+def _run_until_unpaired(store: IdentityStore, trace: Path | None, metrics: "AgentMetrics | None") -> int | None:
     """Run with the saved pairing. Returns the exit code, or ``None`` if the pairing is no longer valid."""
     stop = threading.Event()
     previous = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    agent = bootstrap.build(store, trace=trace)
+    agent = bootstrap.build(store, trace=trace, metrics=metrics)
     try:
         if renderer := bootstrap.renderer_name(AgentConfig.load(store.folder)):
             print(f"renderer {renderer}", flush=True)

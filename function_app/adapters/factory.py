@@ -7,7 +7,7 @@ import hashlib
 import shutil
 import ssl
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
@@ -18,6 +18,7 @@ from function_app.adapters.local.device_feed import MqttDeviceFeed, MqttTelemetr
 from function_app.adapters.local.password_hasher import Argon2Hashes
 from function_app.adapters.local.robot_catalogue import FolderCatalogue
 from function_app.adapters.local.signing_keys import FileKeys
+from function_app.adapters.local.storage_use import StorageUse
 from function_app.adapters.local.table_file import FILE_NAME
 from function_app.adapters.mqtt.connection import Broker
 from function_app.adapters.mqtt.tls import client_context
@@ -29,6 +30,7 @@ from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
 from function_app.ports.device_feed import DeviceFeed, TelemetryFeed
+from function_app.ports.metrics import Metrics, NoMetrics
 from function_app.ports.oidc_provider import OidcProvider
 from function_app.ports.password_hasher import PasswordHasher
 from function_app.ports.robot_catalogue import RobotCatalogue
@@ -57,6 +59,8 @@ class Adapters:
     password_hashes: PasswordHasher
     catalogue: RobotCatalogue
     free_bytes: Callable[[], int | None] = lambda: None
+    stored_bytes: Callable[[], dict[str, int]] = dict
+    metrics: Metrics = field(default_factory=NoMetrics)
 
 
 def adapters(settings: Settings, clock: Clock) -> Adapters:
@@ -88,7 +92,20 @@ def adapters(settings: Settings, clock: Clock) -> Adapters:
         password_hashes=Argon2Hashes(),
         catalogue=FolderCatalogue(settings.robots),
         free_bytes=lambda: _least(free_bytes(settings), tables.left_bytes()),
+        stored_bytes=StorageUse(settings.home / FILE_NAME, settings.home / "blobs").read
+        if settings.store is None
+        else dict,
+        metrics=metrics(),
     )
+
+
+def metrics() -> Metrics:
+    """The metrics of this process; none where the package is not installed, as on cloud hosts."""
+    try:
+        from function_app.adapters.local.prometheus import PrometheusMetrics  # noqa: PLC0415 (optional)
+    except ModuleNotFoundError:
+        return NoMetrics()
+    return PrometheusMetrics()
 
 
 def _least(*sizes: int | None) -> int | None:

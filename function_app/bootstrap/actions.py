@@ -18,7 +18,7 @@ class ActionServices(ControlServices):
 
     @cached_property
     def action_store(self) -> ActionStore:
-        return ActionStore(tables=self.tables)
+        return ActionStore(tables=self.tables, metrics=self.metrics)
 
     @cached_property
     def dispatcher(self) -> ActionDispatcher:
@@ -50,6 +50,7 @@ class ActionServices(ControlServices):
             queues=self.queues,
             mailbox=self.mailbox,
             latencies=self.latencies,
+            metrics=self.metrics,
             clock=self.clock,
         )
 
@@ -95,5 +96,6 @@ class ActionServices(ControlServices):
             queues=self.queues,
             delivery=self.delivery,
             control_events=self.control_events,
+            metrics=self.metrics,
             clock=self.clock,
         )

@@ -17,7 +17,12 @@ class ControlServices(MessagingServices):
     @cached_property
     def control_events(self) -> ControlEvents:
         return ControlEvents(
-            tables=self.tables, events=self.events, audit_log=self.audit_log, reminders=self.reminders, clock=self.clock
+            tables=self.tables,
+            events=self.events,
+            audit_log=self.audit_log,
+            reminders=self.reminders,
+            metrics=self.metrics,
+            clock=self.clock,
         )
 
     @cached_property

@@ -35,7 +35,7 @@ class MessagingServices(HealthServices):
 
     @cached_property
     def command_sender(self) -> CommandSender:
-        return CommandSender(delivery=self.delivery, keys=self.keys, clock=self.clock)
+        return CommandSender(delivery=self.delivery, keys=self.keys, metrics=self.metrics, clock=self.clock)
 
     @cached_property
     def xmpp_credentials(self) -> XmppCredentials:

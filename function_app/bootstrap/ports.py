@@ -23,6 +23,7 @@ class Ports:
         self.feed = adapters.feed
         self.telemetry = adapters.telemetry
         self.late = adapters.late
+        self.metrics = adapters.metrics
 
     async def close(self) -> None:
         """Close all connections."""

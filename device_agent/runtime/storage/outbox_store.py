@@ -57,6 +57,9 @@ class OutboxStore:
         own: Prefix of the agent's topics; messages for another space are deleted.
         max_bytes: Maximum size [B].
         max_age_ms: Maximum age of measurements [ms].
+
+    Attributes:
+        stored_bytes: Size of all messages [B].
     """
 
     def __init__(self, path: Path, *, own: str, max_bytes: int, max_age_ms: int) -> None:
@@ -65,7 +68,7 @@ class OutboxStore:
         self._max_bytes = max_bytes
         self._max_age_ms = max_age_ms
         self._database: sqlite3.Connection | None = None
-        self._bytes = 0
+        self.stored_bytes = 0
         self._age_checked_ms = 0
 
     def open(self) -> None:
@@ -96,7 +99,7 @@ class OutboxStore:
                 f"DELETE FROM {table} WHERE substr({column}, 1, ?) <> ?",  # noqa: S608 (constants, see above)  # nosec B608
                 (len(self._own), self._own),
             )
-        self._bytes = self._database.execute("SELECT coalesce(sum(size), 0) FROM items").fetchone()[0]
+        self.stored_bytes = self._database.execute("SELECT coalesce(sum(size), 0) FROM items").fetchone()[0]
 
     def close(self) -> None:
         """Close the file. May be called twice."""
@@ -114,7 +117,7 @@ class OutboxStore:
 
         def write(database: sqlite3.Connection) -> int:
             database.executemany("INSERT INTO items (late, at_ms, size, topic, payload) VALUES (?, ?, ?, ?, ?)", rows)
-            return self._bytes + sum(row[2] for row in rows)
+            return self.stored_bytes + sum(row[2] for row in rows)
 
         self._change(write)
         self.enforce_bounds(now_ms=now_ms)
@@ -128,7 +131,7 @@ class OutboxStore:
         if not 0 <= now_ms - self._age_checked_ms < _AGE_CHECK_PERIOD_MS:
             self._drop("late = 1 AND at_ms < ?", (now_ms - self._max_age_ms,))
             self._age_checked_ms = now_ms
-        while (excess := self._bytes - self._max_bytes) > 0:
+        while (excess := self.stored_bytes - self._max_bytes) > 0:
             self._drop("late = ? AND id <= ?", self._oldest(excess))
 
     def _oldest(self, excess: int) -> tuple[bool, int]:
@@ -149,7 +152,7 @@ class OutboxStore:
             ).fetchall()
             for late, topic, _ in rows:
                 _count(database, device_of(topic), late=late, count=1)
-            return self._bytes - sum(int(row[2]) for row in rows)
+            return self.stored_bytes - sum(int(row[2]) for row in rows)
 
         self._change(write)
 
@@ -159,7 +162,7 @@ class OutboxStore:
         def write(database: sqlite3.Connection) -> int:
             for (device, late), count in dropped.items():
                 _count(database, device, late=late, count=count)
-            return self._bytes
+            return self.stored_bytes
 
         self._change(write)
 
@@ -197,7 +200,7 @@ class OutboxStore:
             for number in ids:
                 rows = database.execute("DELETE FROM items WHERE id = ? RETURNING size", (number,)).fetchall()
                 removed += sum(row[0] for row in rows)
-            return self._bytes - removed
+            return self.stored_bytes - removed
 
         self._change(write)
 
@@ -219,7 +222,7 @@ class OutboxStore:
                     "INSERT INTO items (late, at_ms, size, topic, payload) VALUES (?, ?, ?, ?, ?)",
                     (item.late, item.at_ms, _size(item), item.topic, item.payload),
                 )
-            return self._bytes + sum(map(_size, items))
+            return self.stored_bytes + sum(map(_size, items))
 
         self._change(write)
 
@@ -230,7 +233,7 @@ class OutboxStore:
             database.execute("BEGIN IMMEDIATE")
             after = write(database)
             database.execute("COMMIT")
-            self._bytes = after
+            self.stored_bytes = after
         except sqlite3.Error as error:
             with contextlib.suppress(sqlite3.Error):
                 database.execute("ROLLBACK")

@@ -128,6 +128,11 @@ class Outbox:
         self._wake.set()
         self._thread.join(timeout=3)
 
+    @property
+    def stored_bytes(self) -> int:
+        """Size of the messages on disk [bytes]."""
+        return self._store.stored_bytes
+
     def add_event(self, topic: str, payload: bytes, *, at_ms: int) -> None:
         """Store an event, and send it as soon as possible."""
         with self._lock:

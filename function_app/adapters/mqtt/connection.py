@@ -330,8 +330,8 @@ class MqttConnection:
     def _detect_freeze(self) -> None:
         """Compares both clocks, because some hosts also stop the monotonic clock."""
         now = self._clocks()
-        paused_s = max(new - old for new, old in zip(now, self._last_run, strict=True))
-        self._last_run = now
+        last, self._last_run = self._last_run, now
+        paused_s = max(now[0] - last[0], now[1] - last[1])
         if paused_s > FREEZE_S and self._ready.is_set():
             self._unverified = True
             if paused_s > SESSION_TIMEOUT_S:

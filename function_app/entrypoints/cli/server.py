@@ -33,7 +33,10 @@ def add_commands(commands: Any) -> None:
         ("xmpp", with_functions(_xmpp), "connect agents that use XMPP"),
         ("prepare", _prepare, "create the vault secret, DynamoDB table and S3 bucket that do not exist yet"),
     ):
-        commands.add_parser(name, help=text, description=text).set_defaults(run=run)
+        command = commands.add_parser(name, help=text, description=text)
+        command.set_defaults(run=run)
+        if name == "work":
+            command.add_argument("--metrics", type=int, metavar="PORT", help="serve metrics at this port of 127.0.0.1")
     text = "compile uploaded robot types with MuJoCo; `work` does this too"
     checks = commands.add_parser("check-models", help=text, description=text)
     checks.add_argument("--drain", action="store_true", help="exit when no upload is left")
@@ -81,7 +84,12 @@ def _prepare(_: argparse.Namespace) -> int:
     return 0
 
 
-async def _work(functions: Functions, _: argparse.Namespace) -> None:
+async def _work(functions: Functions, options: argparse.Namespace) -> None:
+    if options.metrics:
+        try:
+            functions.metrics.serve(options.metrics)
+        except OSError as error:
+            raise SettingsError(f"--metrics {options.metrics}: {error}") from error
     if hasattr(os, "nice"):
         os.nice(_WORKER_NICE)
     with _using(functions):

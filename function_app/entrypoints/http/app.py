@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import time
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
@@ -36,7 +37,7 @@ from function_app.entrypoints.http.framework.routing import (
     Routes,
     schemas,
 )
-from function_app.entrypoints.http.health import diagnostics, faults, health_check
+from function_app.entrypoints.http.health import diagnostics, faults, health_check, metrics
 from function_app.entrypoints.http.messaging import polling, xmpp
 from function_app.entrypoints.http.pairing import agents
 from function_app.entrypoints.http.robot_types import (
@@ -50,6 +51,7 @@ from function_app.entrypoints.http.robot_types import (
 from function_app.entrypoints.http.sharing import routes as sharing
 from function_app.entrypoints.http.telemetry import blob_transfers, events, latency, series, uploads
 from function_app.ports.clock import Clock
+from function_app.ports.metrics import Histogram, Metrics
 from function_app.ports.tables import StoreError, StoreFullError
 from function_app.services.identity.rate_limiter import RateLimiter
 
@@ -64,6 +66,7 @@ _MODULES = (
 """In the order of the OpenAPI document."""
 _log = logging.getLogger(__name__)
 _WRONG_METHOD = 405
+_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE", "PATCH", "OPTIONS"})
 _TITLES = {404: "Not found", _WRONG_METHOD: "Method not allowed"}
 
 
@@ -107,12 +110,14 @@ def create_app(functions: Functions) -> FastAPI:
     app.add_exception_handler(StoreError, _on_store)
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(HTTPException, _on_http)
+    app.add_api_route(metrics.PATH, metrics.endpoint(functions), include_in_schema=False)
     # As default instead of a mount: a mount would also receive requests with a wrong method, which must return 405.
     app.router.default = Console(functions.settings.console)
     app.add_middleware(_Addresses, limits=functions.rate_limiter, proxies=functions.settings.trusted_proxies)
     app.add_middleware(
         _Headers,
         clock=functions.clock,
+        metrics=functions.metrics,
         websocket_url=functions.settings.websocket_url,
         secure=_requires_hsts(functions.settings.public_url),
     )
@@ -223,9 +228,10 @@ class _Addresses:
 class _Headers:
     """Adds headers to every response, and returns a 500 response for unhandled errors. Plain ASGI, for speed."""
 
-    def __init__(self, app: ASGIApp, *, clock: Clock, websocket_url: str, secure: bool) -> None:
+    def __init__(self, app: ASGIApp, *, clock: Clock, metrics: Metrics, websocket_url: str, secure: bool) -> None:
         self._app = app
         self._clock = clock
+        self._metrics = metrics
         policy = (
             "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; font-src 'self'; "
             f"connect-src 'self' {websocket_url.split('?', maxsplit=1)[0]}; base-uri 'none'; form-action 'none'; "
@@ -247,11 +253,20 @@ class _Headers:
             await self._app(scope, receive, send)
             return
         started = False
+        started_s = time.perf_counter()
 
         async def sending(message: Message) -> None:
             nonlocal started
             if message["type"] == "http.response.start":
                 started = True
+                route, method = scope.get("route"), scope["method"]
+                self._metrics.observe(
+                    Histogram.HTTP,
+                    time.perf_counter() - started_s,
+                    method if method in _METHODS else "other",
+                    "console" if route is None else route.path,
+                    str(message["status"]),
+                )
                 now = str(self._clock.now_ms()).encode()
                 message["headers"] = [*message["headers"], *self._fixed, (b"x-telescope-time-ms", now)]
             await send(message)

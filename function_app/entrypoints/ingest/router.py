@@ -8,6 +8,7 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.topics import Topic
 from function_app.bootstrap import Functions
 from function_app.domain.devices.devices import Transport
+from function_app.ports.metrics import Counter
 from function_app.services.telemetry.ingest import InboundMessage
 
 _MAX_LOGGED = 200
@@ -25,6 +26,7 @@ async def ingest(functions: Functions, topic: str, payload: bytes) -> None:
         parsed = topics.parse(topic)
         if not functions.heartbeats.observe(parsed, payload):
             await store_message(functions, parsed, payload)
+            functions.metrics.count(Counter.MESSAGES, parsed.kind)
     except ProtocolError as error:
         _log.warning("dropped a message on %s: %s", topic[:_MAX_LOGGED], error)
 
@@ -66,3 +68,4 @@ async def ingest_telemetry(functions: Functions, messages: Sequence[tuple[str, b
             batch.append(InboundMessage(parsed, payload))
     if batch:
         await functions.telemetry_ingest.ingest(batch)
+        functions.metrics.count(Counter.MESSAGES, batch[0].topic.kind, by=len(batch))

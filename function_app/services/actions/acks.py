@@ -12,6 +12,7 @@ from function_app.domain.common.ids import device_id, split_command
 from function_app.domain.common.json_depth import too_deep
 from function_app.domain.devices.devices import Transport
 from function_app.ports.clock import Clock
+from function_app.ports.metrics import Counter, Metrics
 from function_app.services.actions.action_store import ActionStore, StoredAction
 from function_app.services.actions.queue import ActionQueues
 from function_app.services.messaging.delivery import CONFIRMING
@@ -41,12 +42,14 @@ class ActionAcks:
         queues: ActionQueues,
         mailbox: Mailbox,
         latencies: LatencyStore,
+        metrics: Metrics,
         clock: Clock,
     ) -> None:
         self._action_store = action_store
         self._queues = queues
         self._mailbox = mailbox
         self._latencies = latencies
+        self._metrics = metrics
         self._clock = clock
 
     async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
@@ -60,6 +63,7 @@ class ActionAcks:
         parts = split_command(ack.id)
         if parts is None or parts[0] != device_id(topic.agent, topic.device):
             raise ProtocolError(f"'{ack.id}' is not a command of {topic.agent}/{topic.device}")
+        self._metrics.count(Counter.ACKS, ack.status)
         ack_report = report(ack, self._clock.now_ms())
         if await self._queues.reissue(ack.id, ack_report.device_epoch):
             return

@@ -9,6 +9,7 @@ from function_app.domain.common.ids import split_command
 from function_app.domain.control.lease import release
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
+from function_app.ports.metrics import Histogram, Metrics
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.control.control_events import lease_change
 from function_app.services.devices.control_rows import ControlRows, read_control_rows
@@ -44,8 +45,9 @@ def new_row(action: Action) -> Row:
 class ActionStore:
     """Reads and changes actions."""
 
-    def __init__(self, *, tables: Tables) -> None:
+    def __init__(self, *, tables: Tables, metrics: Metrics) -> None:
         self._tables = tables
+        self._metrics = metrics
 
     async def get(self, action: str) -> StoredAction | None:
         """One action."""
@@ -93,6 +95,9 @@ class ActionStore:
                 writes += _freed(changed, control)
                 waited_for = not control.queue.without(action).empty
             rows = await self._tables.batch(records.CONTROL, writes)
+            if changed.status.terminal and not stored.action.status.terminal:
+                duration_s = (changed.ended_ms - changed.created_ms) / 1000
+                self._metrics.observe(Histogram.ACTIONS, duration_s, changed.status)
             return StoredAction(changed, rows[0], waited_for)
 
         return await records.retry(attempt)

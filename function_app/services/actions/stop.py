@@ -21,6 +21,7 @@ from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.metrics import Counter, Metrics
 from function_app.ports.tables import StoreError
 from function_app.services.actions.queue import ActionQueues
 from function_app.services.control.control_events import ControlEvents
@@ -71,6 +72,7 @@ class StopDevices:
         queues: ActionQueues,
         delivery: Delivery,
         control_events: ControlEvents,
+        metrics: Metrics,
         clock: Clock,
     ) -> None:
         self._devices = devices
@@ -80,6 +82,7 @@ class StopDevices:
         self._queues = queues
         self._delivery = delivery
         self._control_events = control_events
+        self._metrics = metrics
         self._clock = clock
 
     async def stop(self, caller: Identity, device_id: str, reason: str) -> StopResult:
@@ -143,6 +146,13 @@ class StopDevices:
         )
 
     async def _one(
+        self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
+    ) -> StopResult:
+        result = await self._result(caller, device, reason, gate)
+        self._metrics.count(Counter.STOPS, result.outcome)
+        return result
+
+    async def _result(
         self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
     ) -> StopResult:
         try:

@@ -18,6 +18,7 @@ from function_app.domain.control.lease import Lease
 from function_app.domain.devices.devices import Agent, Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
+from function_app.ports.metrics import Counter, Metrics
 from function_app.ports.tables import Row, StoreError, Tables, Write
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.devices.control_rows import read_control_rows
@@ -43,12 +44,20 @@ class ControlEvents:
     """Records control events."""
 
     def __init__(
-        self, *, tables: Tables, events: EventLog, audit_log: AuditLog, reminders: Reminders, clock: Clock
+        self,
+        *,
+        tables: Tables,
+        events: EventLog,
+        audit_log: AuditLog,
+        reminders: Reminders,
+        metrics: Metrics,
+        clock: Clock,
     ) -> None:
         self._tables = tables
         self._events = events
         self._audit_log = audit_log
         self._reminders = reminders
+        self._metrics = metrics
         self._clock = clock
         self._refused: dict[tuple[str, ...], int] = {}
 
@@ -64,7 +73,7 @@ class ControlEvents:
         pairing = lease.pairing if lease else ""
         timeouts = [fact.event(_name(device)) for fact in control_events.timed_out(lease, now_ms)]
         for event in timeouts:
-            await self._events.add(device, pairing, event)
+            await self._add(device, pairing, event)
         if timeouts:
             await self._audit_log.append_all(
                 await self._owner(device, pairing), [_entry(device, event, {}) for event in timeouts]
@@ -87,13 +96,17 @@ class ControlEvents:
         page = await self._tables.query(records.CONTROL, device, first=_EVENT, last="event;", limit=1000)
         owned: dict[str, list[Entry]] = {}
         for row in page.rows:
-            await self._events.add(device, row.data["pairing"], row.data["event"])
+            await self._add(device, row.data["pairing"], row.data["event"])
             owner = row.data.get("owner") or await self._owner(device, row.data["pairing"])
             owned.setdefault(owner, []).append(_entry(device, row.data["event"], row.data.get("by", {})))
         for owner, entries in owned.items():
             await self._audit_log.append_all(owner, entries)
         for row in page.rows:
             await records.discard(self._tables, records.CONTROL, row)
+
+    async def _add(self, device: str, pairing: str, event: Mapping[str, Any]) -> None:
+        await self._events.add(device, pairing, event)
+        self._metrics.count(Counter.CONTROL_EVENTS, event["kind"])
 
     async def _owner(self, device: str, pairing: str) -> str:
         """The account whose audit log contains the events of a pairing."""
@@ -125,7 +138,7 @@ class ControlEvents:
     ) -> Mapping[str, Any]:
         """Add an event to the device's events only, for facts with an audit record of their own; return the event."""
         event = ControlEvent(new_id(), fact, self._clock.now_ms(), message, dict(data), severity).event(device.name)
-        await self._events.add(device.id, device.pairing, event)
+        await self._add(device.id, device.pairing, event)
         return event
 
     @contextlib.asynccontextmanager

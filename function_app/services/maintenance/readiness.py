@@ -36,6 +36,7 @@ class Health:
 
     parts: tuple[Part, ...]
     workers: tuple[Heartbeat, ...] = ()
+    ingest_lag_ms: int = 0
 
     @property
     def status(self) -> Status:
@@ -145,7 +146,7 @@ class ReadinessCheck:
             parts.append(Part(name, finding.status, finding.message, since_ms))
             if last is not None and last.status is not finding.status:
                 _log.warning("health of %s: %s: %s", name, finding.status, finding.message)
-        return Health(tuple(parts), tuple(workers))
+        return Health(tuple(parts), tuple(workers), self._lag_ms())
 
     async def _check_tables(self) -> Finding:
         """A row can be written and read, and no data are known to be lost or damaged."""
@@ -169,7 +170,7 @@ class ReadinessCheck:
         return _took("written and read", started_s)
 
     async def _check_disk(self) -> Finding:
-        return disk_space(await asyncio.to_thread(self._free_bytes), self._min_free_bytes)
+        return disk_space(self._free_bytes(), self._min_free_bytes)
 
     async def _check_broker(self) -> Finding:
         topic, probe = self._heartbeats.probe()
@@ -206,6 +207,9 @@ class ReadinessCheck:
             return Finding(Status.FAILED, _NO_WORKER)
         return Finding(worst(findings), _messages(findings))
 
+    def _lag_ms(self) -> int:
+        return self._clock.now_ms() - self._sent[0] if self._sent else 0
+
     def _ingest(self, workers: list[Heartbeat]) -> Finding:
         """The age of the oldest health message of this server that no running worker has stored."""
         now_ms = self._clock.now_ms()
@@ -215,7 +219,7 @@ class ReadinessCheck:
         stored_ms = max(beat.ingested.get(self._heartbeats.name, 0) for beat in running)
         while self._sent and self._sent[0] <= stored_ms:
             self._sent.popleft()
-        lag_ms = now_ms - self._sent[0] if self._sent else 0
+        lag_ms = self._lag_ms()
         text = f"the oldest waiting message is {lag_ms / 1000:.1f} s old"
         if lag_ms > FAILED_MS:
             return Finding(Status.FAILED, f"{text}. Read the log of the worker, and check the broker.")

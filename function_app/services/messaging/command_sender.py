@@ -14,6 +14,7 @@ from function_app.domain.common.problems import broker_unavailable, invalid
 from function_app.domain.devices.devices import Device
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.metrics import Counter, Metrics
 from function_app.ports.signing_keys import SigningKeys
 from function_app.services.messaging.delivery import Confirmation, Delivery, SignedCommand
 
@@ -30,9 +31,10 @@ _log = logging.getLogger(__name__)
 class CommandSender:
     """Builds, signs and sends commands."""
 
-    def __init__(self, *, delivery: Delivery, keys: SigningKeys, clock: Clock) -> None:
+    def __init__(self, *, delivery: Delivery, keys: SigningKeys, metrics: Metrics, clock: Clock) -> None:
         self._delivery = delivery
         self._keys = keys
+        self._metrics = metrics
         self._clock = clock
 
     def validated(self, device: Device, id_: str, request: Request, *, caller: str) -> Command:
@@ -60,6 +62,7 @@ class CommandSender:
             payload = signing.sign(codec.encode(command), await self._keys.for_devices())
         except ProtocolError as error:
             raise invalid(f"{error}.") from error
+        self._metrics.count(Counter.COMMANDS, str(command.request.__struct_config__.tag))
         stop = isinstance(command.request, StopDevice)
         expires_ms = command.issued_at_ms + (STOP_LIFETIME_MS if stop else command.ttl_ms)
         return SignedCommand(command.id, payload, expires_ms, first=stop)

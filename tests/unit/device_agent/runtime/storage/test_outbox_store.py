@@ -85,7 +85,7 @@ def test_beyond_the_bound_oldest_measurements_then_events_are_dropped_and_counte
     store = open_store(max_bytes=200_000)
     for number in range(300):
         store.put([item(number, EVENT, size=200), item(number, size=1000)], now_ms=NOW_MS)
-        assert store._bytes <= 200_000
+        assert store.stored_bytes <= 200_000
     assert numbers(store, late=False) == list(range(300)), "no event is dropped while there are measurements"
     left = numbers(store)
     assert left == list(range(300 - len(left), 300)), "the newest remain"
@@ -106,8 +106,8 @@ def test_the_stored_size_is_always_correct(open_store: OpenStore) -> None:
         store.remove([number // 2, number // 3])
         if number % 50 == 0:
             dropped(store)
-    size = store._bytes
-    assert open_store()._bytes == size
+    size = store.stored_bytes
+    assert open_store().stored_bytes == size
 
 
 def test_old_measurements_are_dropped_and_counted(store: OutboxStore) -> None:
@@ -155,11 +155,11 @@ def test_an_unusable_file_raises(tmp_path: Path) -> None:
 
 def test_a_full_disk_changes_nothing_and_raises(tmp_path: Path, store: OutboxStore) -> None:
     store.put([item(1)], now_ms=NOW_MS)
-    before = store._bytes
+    before = store.stored_bytes
     store._connection().execute("PRAGMA max_page_count = 1")
     with pytest.raises(OutboxStoreError, match="is the disk full"):
         store.put([item(2), item(3, size=500_000)], now_ms=NOW_MS)
-    assert (numbers(store), store._bytes) == ([1], before)
+    assert (numbers(store), store.stored_bytes) == ([1], before)
     store._connection().execute("PRAGMA max_page_count = 100000")
     store.put([item(4)], now_ms=NOW_MS)
     assert numbers(store) == [1, 4]
