@@ -1,7 +1,6 @@
 """``python -m device_agent COMMAND``: the agent's command line."""
 
 import argparse
-import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ from device_agent.config.errors import ConfigError
 from device_agent.load_generator.options import LoadTestError
 from device_agent.ports.driver import DriverError
 from device_agent.ports.transport import TransportError
-from device_agent.protocol.security import private_folder
+from device_agent.protocol.security import log_output, private_folder
 from device_agent.runtime.storage.journal import JournalError
 from device_agent.transports.http.client import CloudError
 
@@ -27,8 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     os.umask(private_folder.UMASK)
     options = _parser().parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     try:
+        log_output.configure(options)
         code: int = options.command(options)
     except (ConfigError, JournalError, DriverError, TransportError, CloudError, LoadTestError, OSError) as error:
         print(f"telescope agent: {error}", file=sys.stderr)
@@ -40,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m device_agent", description="The Telescope agent of a robot.")
+    log_output.add_arguments(parser, os.environ)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     home = Path(os.environ.get("TELESCOPE_AGENT_HOME", Path.home() / ".telescope-agent"))
     for module in _COMMANDS:

@@ -77,6 +77,7 @@ class LocalStack:
         """
         while not stopping.wait(0.2):
             for child in self._children:
+                child.limit_log()
                 if child.exited:
                     log_progress(f"{child.name} exited and is restarted ({child.last_line()})")
                     child.restart()

@@ -1,5 +1,7 @@
 """Supervised child processes: start, monitor, restart and stop."""
 
+import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +14,7 @@ from infra import programs
 _STOP_TIMEOUT_S = 8.0
 _STABLE_S = 10.0
 _MAX_RESTARTS = 5
+_MAX_LOG_BYTES = 10_000_000
 
 
 class StartError(Exception):
@@ -72,6 +75,13 @@ class SupervisedProcess:
                 raise StartError(self.last_line())
             time.sleep(0.05)
         raise StartError(f"{self.name} did not start within {timeout_s:.0f} s; see {self.log}")
+
+    def limit_log(self) -> None:
+        """Move the lines of a long log to ``NAME.log.1``, and continue with an empty one."""
+        if self.log.stat().st_size > _MAX_LOG_BYTES:
+            shutil.copyfile(self.log, self.log.with_suffix(".log.1"))
+            os.truncate(self.log, 0)  # the process appends to the open file
+            self._log_start = 0
 
     @property
     def exited(self) -> bool:

@@ -35,7 +35,7 @@ from device_agent.protocol import (
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.fields import printable
-from device_agent.protocol.security import signing
+from device_agent.protocol.security import log_output, signing
 from device_agent.runtime.actions.executor import ActionExecutor
 from device_agent.runtime.authority.control_request import PendingControlRequest
 from device_agent.runtime.authority.event_recorder import EventRecord, EventRecorder
@@ -151,6 +151,7 @@ class CommandProcessor:
             with contextlib.suppress(queue.Empty):
                 payload = self._commands.get(timeout=_CONFIRM_S if self._pending_stops else _IDLE_S)
                 self._guarded(partial(self._process, payload))
+            log_output.context.set(None)
             # Guarded separately: with a full disk, state and events are still published.
             for step in (
                 self._write_journal,
@@ -198,6 +199,7 @@ class CommandProcessor:
         except ProtocolError as error:
             self._record_rejection("malformed", str(error)[:300])
             return
+        log_output.context.set(lambda: {"device": self._name, "action": command.id})
         if (command.space, command.agent, command.device) != self._address:
             self._record_rejection("wrong_address", "it is addressed to another device", command)
             return

@@ -58,6 +58,7 @@ def serve(functions: Functions) -> None:
         timeout_keep_alive=KEEP_ALIVE_S,
         access_log=False,
         log_level="warning",
+        log_config=None,  # its lines go to the log of this program
         server_header=False,
         proxy_headers=False,  # TELESCOPE_TRUSTED_PROXIES applies instead
         timeout_graceful_shutdown=3,

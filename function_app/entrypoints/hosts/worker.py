@@ -9,9 +9,11 @@ import function_app
 from function_app.bootstrap import Functions
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from function_app.ports.model_compiler import CompilerMissingError
-from function_app.services.maintenance.heartbeats import JOBS
+from function_app.services.maintenance.heartbeats import HEALTH_TOPICS, JOBS
 
 SWEEP_EVERY_S = 1.0
+SWEEP_TIMEOUT_S = 120.0
+"""A run that waits longer is repeated: all jobs are idempotent."""
 CHECK_EVERY_S = 0.2
 CATCH_UP_S = 10.0
 """After a start or a suspension, agents need this time to repeat what the worker has missed [s]."""
@@ -32,7 +34,8 @@ async def work(functions: Functions) -> None:
 
     async def handle(topic: str, payload: bytes) -> None:
         await ingest(functions, topic, payload)
-        await functions.confirmations.publish([(topic, payload)])
+        if not topic.startswith(HEALTH_TOPICS):
+            await functions.confirmations.publish([(topic, payload)])
 
     async def handle_telemetry(messages: Sequence[tuple[str, bytes]]) -> None:
         await ingest_telemetry(functions, messages)
@@ -94,7 +97,8 @@ async def _sweep(functions: Functions) -> None:
             current_s = loop.time() + CATCH_UP_S
         ran_s = loop.time()
         try:
-            await functions.scheduler.run_due_jobs(current=ran_s >= current_s)
+            async with asyncio.timeout(SWEEP_TIMEOUT_S):
+                await functions.scheduler.run_due_jobs(current=ran_s >= current_s)
             functions.heartbeats.ran(JOBS)
         except Exception:  # noqa: BLE001 (the timer continues after a failed run)
             _log.exception("timer")

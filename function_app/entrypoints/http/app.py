@@ -2,6 +2,8 @@
 
 import asyncio
 import logging
+import re
+import secrets
 import time
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
@@ -16,6 +18,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from device_agent.protocol.security import log_output
 from function_app import VERSION
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem, invalid, store_unavailable
@@ -65,6 +68,7 @@ _MODULES = (
 )  # fmt: skip
 """In the order of the OpenAPI document."""
 _log = logging.getLogger(__name__)
+_REQUEST_ID = re.compile(rb"[A-Za-z0-9_.:-]{1,64}")
 _WRONG_METHOD = 405
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE", "PATCH", "OPTIONS"})
 _TITLES = {404: "Not found", _WRONG_METHOD: "Method not allowed"}
@@ -252,6 +256,8 @@ class _Headers:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
+        request_id = _request_id(scope)
+        log_output.context.set(lambda: _log_context(scope, request_id.decode()))
         started = False
         started_s = time.perf_counter()
 
@@ -268,7 +274,8 @@ class _Headers:
                     str(message["status"]),
                 )
                 now = str(self._clock.now_ms()).encode()
-                message["headers"] = [*message["headers"], *self._fixed, (b"x-telescope-time-ms", now)]
+                own = ((b"x-telescope-time-ms", now), (b"x-request-id", request_id))
+                message["headers"] = [*message["headers"], *self._fixed, *own]
             await send(message)
 
         try:
@@ -281,3 +288,21 @@ class _Headers:
                 raise
             detail = "The server failed and logged the error. Try again."
             await problem(Problem("internal", 500, "Internal error", detail))(scope, receive, sending)
+
+
+def _request_id(scope: Scope) -> bytes:
+    """The request id of the client, or a new one."""
+    for name, value in scope["headers"]:
+        if name == b"x-request-id" and _REQUEST_ID.fullmatch(value):
+            received: bytes = value
+            return received
+    return secrets.token_hex(8).encode()
+
+
+def _log_context(scope: Scope, request_id: str) -> dict[str, str]:
+    parameters = scope.get("path_params", {})
+    return {
+        "request": request_id,
+        "device": str(parameters.get("device", "")),
+        "action": str(parameters.get("action", "")),
+    }

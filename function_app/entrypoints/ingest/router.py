@@ -3,10 +3,12 @@
 import logging
 from collections.abc import Sequence
 
-from device_agent.protocol import topics
+from device_agent.protocol import Ack, codec, topics
 from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.security import log_output
 from device_agent.protocol.topics import Topic
 from function_app.bootstrap import Functions
+from function_app.domain.common.ids import device_id
 from function_app.domain.devices.devices import Transport
 from function_app.ports.metrics import Counter
 from function_app.services.telemetry.ingest import InboundMessage
@@ -24,11 +26,17 @@ async def ingest(functions: Functions, topic: str, payload: bytes) -> None:
     """
     try:
         parsed = topics.parse(topic)
+        log_output.context.set(lambda: _log_context(parsed, payload))
         if not functions.heartbeats.observe(parsed, payload):
             await store_message(functions, parsed, payload)
             functions.metrics.count(Counter.MESSAGES, parsed.kind)
     except ProtocolError as error:
         _log.warning("dropped a message on %s: %s", topic[:_MAX_LOGGED], error)
+
+
+def _log_context(topic: Topic, payload: bytes) -> dict[str, str]:
+    action = codec.decode(payload, Ack).id if topic.kind == topics.ACK else ""
+    return {"device": device_id(topic.agent, topic.device) if topic.device else "", "action": action}
 
 
 async def store_message(functions: Functions, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:

@@ -13,6 +13,7 @@ import socket
 from dataclasses import dataclass, field
 
 from device_agent.protocol import Ack, AckStatus, Presence, codec, topics
+from device_agent.protocol.security import log_output
 from device_agent.protocol.topics import Topic
 from function_app.domain.health.server_health import Finding, Status
 from function_app.ports.clock import Clock
@@ -30,6 +31,7 @@ TIMER = "timer"
 """Name of the heartbeat of a cloud host's timer."""
 SPACE = "telescope-server"
 """Space of the health messages. Ids of real spaces have another form, and agents cannot publish there."""
+HEALTH_TOPICS = f"{topics.ROOT}/{SPACE}/"
 _AGENT = "health"
 _WORKERS = "workers"
 _MAX_SERVERS = 16
@@ -55,7 +57,7 @@ class Heartbeat:
         ingested: Name of a server → its newest health message that this worker stored [ms since 1970].
         agents_online: Connected agents.
         devices_online: Devices of connected agents.
-        errors: Recent warnings and errors.
+        errors: Recent warnings and errors: time [ms since 1970], level, message.
     """
 
     name: str
@@ -69,7 +71,7 @@ class Heartbeat:
     ingested: dict[str, int] = field(default_factory=dict)
     agents_online: int = 0
     devices_online: int = 0
-    errors: tuple[str, ...] = ()
+    errors: tuple[tuple[int, str, str], ...] = ()
 
     def age(self, now_ms: int) -> Finding:
         """Whether the heartbeat is in time."""
@@ -119,7 +121,7 @@ class Heartbeats:
     def probe(self) -> tuple[str, Ack]:
         """A new health message of this server and its device topic."""
         ack = Ack(id=secrets.token_hex(8), status=AckStatus.DONE, sequence=0, at_ms=self._clock.now_ms(), tick_ms=0)
-        return f"{topics.ROOT}/{SPACE}/{_AGENT}/{self.name}", ack
+        return f"{HEALTH_TOPICS}{_AGENT}/{self.name}", ack
 
     def observe(self, topic: Topic, payload: bytes) -> bool:
         """Count a received message; returns whether it is a health message, which needs no further storage.
@@ -183,6 +185,7 @@ class Heartbeats:
             ingested=self._ingested,
             agents_online=len(self._online),
             devices_online=sum(map(len, self._online.values())),
+            errors=tuple(log_output.recent.lines()),
         )
         await records.upsert(self._tables, records.WORKERS, _WORKERS, name, lambda _: beat, Heartbeat)
 

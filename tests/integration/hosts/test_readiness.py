@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from tests.harness.cloud.cloud import API
-from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
+from tests.harness.cloud.cloud_processes import CloudProcesses, Server, start_cloud_processes
 from tests.harness.hosts.host import Program, environment_of, start_program
 from tests.harness.network.brokers import BrokerKind, wait_until
 
@@ -22,6 +22,9 @@ SHOWN_S = 5.0
 REPAIRED_S = 10.0
 DISK_MB = 48
 MIN_FREE_MB = 20
+FAILING = 2_000
+MAX_LOGGED = 20_000
+"""Bytes that server and worker may log for so many messages that cannot be stored."""
 
 
 class Site:
@@ -45,6 +48,20 @@ class Site:
 
     def not_ok(self) -> set[str]:
         return {name for name, part in self.parts().items() if part["status"] != "ok"} - {"models"}
+
+    def logged_bytes(self) -> int:
+        """How much the programs log for requests and messages that fail."""
+        server = self.processes.endpoints["server"]
+        assert isinstance(server, Server)
+        assert server._program is not None
+        before = len(server._program.stderr()) + len(self.worker.stderr())
+        cloud = self.processes.cloud
+        for _ in range(FAILING):
+            cloud.run(cloud.functions.bus.publish("ts/v1/s/a/arm/ack", b"no ack"))
+        for _ in range(FAILING // 10):
+            self.http.post("/auth/sign-in", json={"account": "anna", "password": "wrong"})
+        wait_until(lambda: self.parts()["ingest"]["status"] == "ok", "the end of the messages")
+        return len(server._program.stderr()) + len(self.worker.stderr()) - before
 
     def await_ok(self) -> float:
         return _duration_s(lambda: not self.not_ok(), f"ok, not {self.parts()}")
@@ -164,6 +181,7 @@ def test_a_full_disk_is_shown(tmp_path: Path) -> None:
         shown_s = site.await_shown("disk")
         wait_until(lambda: site.parts()["disk"]["status"] == "failed", "a full disk")
         assert "Free disk space" in site.parts()["disk"]["message"]
+        assert site.logged_bytes() <= MAX_LOGGED
         filler.unlink()
         in_time(shown_s, site.await_ok())
 

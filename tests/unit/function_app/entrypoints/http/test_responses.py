@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from fastapi.routing import APIRoute
 from starlette.routing import Match
 from starlette.types import Scope
 
+from device_agent.protocol.security.log_output import TextFormatter
 from function_app.domain.common.problems import Problem
 from function_app.entrypoints.http.framework.responses import MAX_BODY
 from function_app.entrypoints.http.framework.responses import problem as problem_response
@@ -172,6 +174,30 @@ class TestHeaders:
         assert headers["referrer-policy"] == "no-referrer"
         assert headers["x-frame-options"] == "DENY"
         assert headers["cross-origin-opener-policy"] == "same-origin"
+
+    @pytest.mark.parametrize(
+        ("received", "kept"), [("a-1.b:2_C", True), ("", False), ("with space", False), ("x" * 65, False)]
+    )
+    def test_every_response_has_the_request_id_of_the_client_or_a_new_one(
+        self, cloud: Cloud, caplog: pytest.LogCaptureFixture, received: str, kept: bool
+    ) -> None:
+        headers = [cloud.request("GET", "/api/v1/nothing", headers={"X-Request-Id": received}).headers for _ in "12"]
+        ids = [each["x-request-id"] for each in headers]
+        assert (ids == [received] * 2) is kept
+        assert (len(set(ids)) == 2) is not kept
+        assert not caplog.records
+
+    def test_log_lines_of_a_request_name_it_and_its_device(self, cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
+        lines = []
+
+        async def broken(*_: object) -> None:
+            lines.append(TextFormatter().format(logging.LogRecord("x", 30, "", 1, "broken", (), None)))
+            raise RuntimeError
+
+        monkeypatch.setattr(cloud.functions.devices, "view", broken)
+        anna = cloud.sign_in("anna")
+        anna.get("/devices/a-arm", headers={"X-Request-Id": "r7"})
+        assert lines[0].endswith("broken [request=r7 device=a-arm]")
 
     def test_every_response_has_the_server_time(self, tmp_path: Path) -> None:
         clock = MovingClock()
