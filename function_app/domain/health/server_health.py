@@ -41,7 +41,7 @@ def disk_space(free_bytes: int | None, min_free_bytes: int) -> Finding:
     """The state of a disk. A cloud store has no fixed size (``None``)."""
     if free_bytes is None:
         return Finding(Status.OK, "the cloud store has no fixed size")
-    free = f"{free_bytes / 1e6:.0f} MB free"
+    free = f"{free_bytes / 1e9:.1f} GB free" if free_bytes >= 1e9 else f"{free_bytes / 1e6:.0f} MB free"  # noqa: PLR2004
     if free_bytes < min_free_bytes / 10:
         return Finding(Status.FAILED, f"{free}: rows and keys may soon not be stored. Free disk space now.")
     if free_bytes < min_free_bytes:

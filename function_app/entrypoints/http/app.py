@@ -40,7 +40,7 @@ from function_app.entrypoints.http.framework.routing import (
     Routes,
     schemas,
 )
-from function_app.entrypoints.http.health import diagnostics, faults, health_check, metrics
+from function_app.entrypoints.http.health import administration, diagnostics, faults, health_check, metrics
 from function_app.entrypoints.http.messaging import polling, xmpp
 from function_app.entrypoints.http.pairing import agents
 from function_app.entrypoints.http.robot_types import (
@@ -64,7 +64,7 @@ _MODULES = (
     auth, me, second_factor, oidc, api_keys, agents, polling, audit, devices, device_library, sharing, lease, stop,
     actions, many, robot_types, agent_packages, previews, movements, script_editor, mqtt_credentials, xmpp, latency,
     faults, events,
-    diagnostics, series, uploads, health_check,
+    diagnostics, series, uploads, health_check, administration,
 )  # fmt: skip
 """In the order of the OpenAPI document."""
 _log = logging.getLogger(__name__)

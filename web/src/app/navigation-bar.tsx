@@ -15,7 +15,7 @@ export function Navigation({ account, session }: { account: Account; session: Se
         {texts.product}
       </a>
       <nav aria-label={texts.sections.title}>
-        {LINKS.map(({ link, address, part }) => (
+        {LINKS.filter(({ part }) => part !== "administration" || account.administrator).map(({ link, address, part }) => (
           <a key={part} href={address} aria-current={part === here ? "page" : undefined}>
             {link}
           </a>

@@ -21,7 +21,7 @@ export interface PageProps extends RouteParameters {
 }
 
 type Loaded = Promise<ComponentType<PageProps>>;
-type Part = "account" | "devices" | "health" | "movements" | "robotTypes" | "latency";
+type Part = "account" | "administration" | "devices" | "health" | "movements" | "robotTypes" | "latency";
 
 interface Page {
   readonly title: string | ((at: RouteParameters, fleet: Fleet) => string);
@@ -121,6 +121,12 @@ export const PAGES = {
     title: (at: RouteParameters, fleet: Fleet): string => texts.pages.latencyOf(device(at.device, fleet)),
     part: "latency",
     load: latency,
+  },
+  administration: {
+    title: texts.sections.administration,
+    part: "administration",
+    link: texts.sections.administration,
+    load: async (): Loaded => (await import("../features/health/administration/page")).AdministrationPage,
   },
   account: {
     title: texts.pages.account,

@@ -16,6 +16,7 @@ export const texts = {
     title: "Main navigation",
     devices: "Devices",
     health: "Health",
+    administration: "Administration",
     latency: "Latency",
     movements: "Movements",
     robotTypes: "Robot types",

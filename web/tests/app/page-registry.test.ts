@@ -28,6 +28,7 @@ describe("the table of pages", () => {
       deviceLatency: route.latencyAddressOf("a-b"),
       account: route.accountAddress,
       auditLog: route.auditLogAddress,
+      administration: route.pageAddress("administration"),
       invitation: route.invitationAddress,
     } satisfies Record<PageName, string>;
     for (const [page, address] of Object.entries(addresses)) expect(route.read(address).page, address).toBe(page);

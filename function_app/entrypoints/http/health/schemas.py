@@ -166,3 +166,45 @@ class HealthOut(Response, frozen=True, kw_only=True):
     broker: str
     models: str
     parts: tuple[PartOut, ...] | None
+
+
+class WorkerOut(Response, frozen=True, kw_only=True):
+    """A process that stores messages and runs timers. ``seen_at``: its newest heartbeat."""
+
+    name: str
+    host: str
+    version: str
+    started_at: Moment
+    seen_at: Moment
+
+
+class BrokerOut(Response, frozen=True, kw_only=True):
+    """The broker of the installation, and its address for agents."""
+
+    kind: str
+    address: str
+
+
+class LoggedOut(Response, frozen=True, kw_only=True):
+    """A recent line of a log. ``program``: ``server``, or the name of a worker."""
+
+    program: str
+    at: Moment
+    level: str
+    message: str
+
+
+class AdministrationOut(Response, frozen=True, kw_only=True):
+    """The state of the installation. Sizes are null for a cloud store."""
+
+    status: Status
+    version: str
+    parts: tuple[PartOut, ...]
+    workers: tuple[WorkerOut, ...]
+    broker: BrokerOut
+    agents_online: int
+    devices_online: int
+    tables_bytes: int | None
+    blobs_bytes: int | None
+    free_bytes: int | None
+    errors: tuple[LoggedOut, ...]

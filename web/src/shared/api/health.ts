@@ -104,6 +104,31 @@ export interface ServerHealth {
   models: string;
 }
 
+export type PartStatus = "ok" | "degraded" | "failed";
+
+/** One part of the server; `message` is the cause and the remedy, or a figure. */
+export interface ServerPart {
+  name: string;
+  status: PartStatus;
+  message: string;
+  since: string;
+}
+
+/** The state of the installation, for administrators. Sizes are null for a cloud store. */
+export interface Installation {
+  status: PartStatus;
+  version: string;
+  parts: ServerPart[];
+  workers: { name: string; host: string; version: string; started_at: string; seen_at: string }[];
+  broker: { kind: string; address: string };
+  agents_online: number;
+  devices_online: number;
+  tables_bytes: number | null;
+  blobs_bytes: number | null;
+  free_bytes: number | null;
+  errors: { program: string; at: string; level: string; message: string }[];
+}
+
 export const RANK: Readonly<Record<HealthState, number>> = { ok: 0, unknown: 1, warning: 2, fault: 3 };
 
 /** All methods throw only `ApiError`. */
@@ -122,6 +147,10 @@ export class HealthApi {
 
   server(): Promise<ServerHealth> {
     return this.#http.call("GET", "/health");
+  }
+
+  installation(): Promise<Installation> {
+    return this.#http.call("GET", "/administration");
   }
 
   of(device: string): Promise<DeviceHealth> {

@@ -6,6 +6,8 @@ export interface Account {
   id: string;
   name: string;
   session: string;
+  /** Whether the account may read the state of the server. */
+  administrator: boolean;
 }
 
 /** Stored captures, movements and robot types of the account. */

@@ -25,6 +25,7 @@ const PATTERNS = {
   deviceLatency: "#/devices/:device/latency",
   account: "#/account",
   auditLog: "#/account/audit-log",
+  administration: "#/administration",
   invitation: "#/invitation",
 } as const;
 

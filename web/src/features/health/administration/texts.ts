@@ -1,0 +1,45 @@
+import type { PartStatus } from "../../../shared/api/health";
+import { format } from "../../../shared/i18n/format";
+
+export const texts = {
+  title: "Administration",
+  explained: "The state of this server. The page refreshes every two seconds.",
+  notAllowed: "Only administrators of this server may see this page. The setting TELESCOPE_ADMINISTRATORS names them.",
+  failed: (reason: string): string => `The state failed to load: ${reason}`,
+  outdated: "The figures below are from before the error.",
+  status: { ok: "OK", degraded: "Degraded", failed: "Failed" } satisfies Record<PartStatus, string>,
+  summary: {
+    ok: "All parts work.",
+    degraded: "Robots can be operated, but a part needs attention.",
+    failed: "A part has failed.",
+  } satisfies Record<PartStatus, string>,
+  parts: "Parts",
+  part: {
+    tables: "Tables",
+    blobs: "Blobs",
+    broker: "Broker",
+    models: "Model checks",
+    workers: "Workers",
+    disk: "Disk space",
+    timers: "Timers",
+    ingest: "Message ingest",
+  } as Readonly<Record<string, string>>,
+  since: (when: string): string => `since ${when}`,
+  workers: "Workers",
+  noWorkers: "No worker runs.",
+  worker: { name: "Name", host: "Machine", version: "Version", started: "Started", seen: "Last heartbeat" },
+  installation: "Installation",
+  fact: {
+    version: "Server version",
+    broker: "Broker",
+    agents: "Connected agents",
+    devices: "Their devices",
+    tables: "Size of the tables",
+    blobs: "Size of the blobs",
+    free: "Free disk space",
+  },
+  size: (bytes: number | null): string => (bytes === null ? "in the cloud" : bytes < 1e9 ? format.fileSize(bytes) : `${(bytes / 1e9).toFixed(1)} GB`),
+  errors: "Recent warnings and errors",
+  errorsExplained: "Of the server and its workers since their start. Each text appears once, with its newest time.",
+  noErrors: "None.",
+} as const;
