@@ -152,3 +152,29 @@ def _create(path: Path, number: int) -> str:
         return ""
 
     return asyncio.run(create())
+
+
+def test_a_deleted_or_replaced_file_is_never_read_or_written(tmp_path: Path) -> None:
+    """Rows that are written to a deleted file are lost."""
+    file, aside = tmp_path / "tables.sqlite", tmp_path / "aside"
+    tables = SqliteTables(file)
+
+    async def refused() -> None:
+        for call in (tables.check(), tables.get("T", "p", "k"), tables.create("T", Row("p", "new", {}))):
+            with pytest.raises(StoreError, match="deleted or replaced while in use"):
+                await call
+
+    async def use() -> None:
+        await tables.create("T", Row("p", "k", {"a": 1}))
+        file.rename(aside)
+        await refused()
+        assert not file.exists()
+        file.write_bytes(aside.read_bytes())
+        await refused()
+        aside.replace(file)
+        await tables.check()
+        assert await tables.get("T", "p", "new") is None
+        assert await tables.get("T", "p", "k") is not None
+        await tables.close()
+
+    asyncio.run(use())
