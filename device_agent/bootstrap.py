@@ -266,7 +266,7 @@ def build(store: IdentityStore, *, trace: Path | None = None, metrics: "AgentMet
         now_ms=clock.now_ms,
         listen=readings.topics(),
     )
-    latencies = LatencyReports(pairing.agent, _transport_name(configuration), wiring.open_api)
+    latencies = LatencyReports(pairing.agent, configuration.transport_name, wiring.open_api)
     link = factory.make(wiring)
     transport = LatencyProbe(
         link if metrics is None else metrics.measured(link),
@@ -307,12 +307,6 @@ def build(store: IdentityStore, *, trace: Path | None = None, metrics: "AgentMet
         metrics.read_from(devices, outbox)
     agent = Agent(devices, transport, outbox=outbox, readings=readings, address=(pairing.space, pairing.agent))
     return RunningAgent(agent, journal, monitor, sandbox, supervisor)
-
-
-def _transport_name(configuration: AgentConfig) -> str:
-    """Name of the transport in latency reports."""
-    plain = configuration.transport == "http" and configuration.http.poll == "plain"
-    return "http-poll" if plain else configuration.transport
 
 
 def _own_streams(configuration: AgentConfig) -> Iterator[tuple[str, str]]:

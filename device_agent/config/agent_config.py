@@ -103,6 +103,11 @@ class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     buffer: Buffer = Buffer()
     room: Annotated[tuple[RoomStream, ...], Meta(max_length=64)] = ()
 
+    @property
+    def transport_name(self) -> str:
+        """Name of the transport in latency reports: plain polling has a name of its own."""
+        return "http-poll" if self.transport == "http" and self.http.poll == "plain" else self.transport
+
     @classmethod
     def load(cls, folder: Path) -> "AgentConfig":
         """Read and check ``agent.toml`` in the agent's folder.

@@ -15,10 +15,10 @@ from function_app.adapters.local.certificates import FileCertificates, NoCertifi
 from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_bus import MqttCommandBus
 from function_app.adapters.local.device_feed import MqttDeviceFeed, MqttTelemetryFeed
+from function_app.adapters.local.monitoring.storage_use import StorageUse
 from function_app.adapters.local.password_hasher import Argon2Hashes
 from function_app.adapters.local.robot_catalogue import FolderCatalogue
 from function_app.adapters.local.signing_keys import FileKeys
-from function_app.adapters.local.storage_use import StorageUse
 from function_app.adapters.local.table_file import FILE_NAME
 from function_app.adapters.mqtt.connection import Broker
 from function_app.adapters.mqtt.tls import client_context
@@ -102,7 +102,7 @@ def adapters(settings: Settings, clock: Clock) -> Adapters:
 def metrics() -> Metrics:
     """The metrics of this process; none where the package is not installed, as on cloud hosts."""
     try:
-        from function_app.adapters.local.prometheus import PrometheusMetrics  # noqa: PLC0415 (optional)
+        from function_app.adapters.local.monitoring.prometheus import PrometheusMetrics  # noqa: PLC0415 (optional)
     except ModuleNotFoundError:
         return NoMetrics()
     return PrometheusMetrics()

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from device_agent.protocol import AckStatus
-from function_app.adapters.local.prometheus import PrometheusMetrics
+from function_app.adapters.local.monitoring.prometheus import PrometheusMetrics
 from function_app.settings import Administration
 from tests.fixtures.cloud import OpenCloud
 from tests.harness.cloud.cloud import API, Cloud, paired, problem

@@ -1,0 +1,1 @@
+"""Metrics and storage use of the local server."""
