@@ -154,7 +154,7 @@ def test_a_missing_and_a_replaced_tables_file_are_shown(site: Site) -> None:
             file.write_bytes(replacement)
         try:
             shown_s = site.await_shown("tables")
-            assert "restore the file" in site.parts()["tables"]["message"]
+            assert "restore a backup" in site.parts()["tables"]["message"]
             assert httpx.get(site.processes.url + API + "/health").status_code == 503
         finally:
             aside.rename(file)
