@@ -11,13 +11,10 @@ from device_agent.runtime.commands.command_processor import CommandProcessor
 from device_agent.runtime.control import setpoint_stream
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.storage.journal import Journal
-from function_app.domain.actions import action as action_rules
-from function_app.domain.actions.action import AckReport, Action
 from function_app.domain.control import lease as lease_rules
 from function_app.domain.control.lease import Lease
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import Row, Write
-from function_app.services.actions import acks
 from function_app.services.devices.control_rows import SLOT
 from tests.simulation.actors.instance import SharedTables
 
@@ -82,18 +79,6 @@ def _epoch_not_persisted() -> AbstractContextManager[None]:
     return _patched(Journal, "save_epoch", lambda *_, **__: None)
 
 
-def _ack_after_terminal() -> AbstractContextManager[None]:
-    """A late terminal ack changes the terminal state."""
-    apply = action_rules.apply_report
-
-    def apply_always(action: Action, report: AckReport) -> Action:
-        if action.status.terminal and report.status.terminal and report.status is not action.status:
-            return replace(action, status=report.status)
-        return apply(action, report)
-
-    return _patched(acks, "apply_report", apply_always)
-
-
 def _ttl_ignored() -> AbstractContextManager[None]:
     """The agent does not check the time to live."""
     return _patched(CommandProcessor, "_check_time", lambda *_: None)
@@ -130,7 +115,6 @@ DEFECTS: dict[str, Callable[[], AbstractContextManager[None]]] = {
     "slot-without-etag": _slot_without_etag,
     "latch-not-persisted": _latch_not_persisted,
     "epoch-not-persisted": _epoch_not_persisted,
-    "ack-after-terminal": _ack_after_terminal,
     "ttl-ignored": _ttl_ignored,
     "no-watchdog": _no_watchdog,
     "renewed-after-expiry": _renewed_after_expiry,

@@ -8,16 +8,11 @@ from typing import NamedTuple
 
 from tests.simulation import planted
 from tests.simulation.checks.history import History, Violation
-from tests.simulation.plan import FAULTS, Step, create
+from tests.simulation.plan import Step, create
 from tests.simulation.shrink import shrink
 from tests.simulation.world import World
 
-ANY_FAULT = frozenset(FAULTS)
 PENDING: dict[str, frozenset[str]] = {
-    "completed-not-done (lost)": ANY_FAULT,
-    "completed-not-done (no-answer)": ANY_FAULT,
-    "other-status (lost)": ANY_FAULT,
-    "other-status (no-answer)": ANY_FAULT,
     "blocked (lease)": frozenset({"restore"}),
     "blocked (reset)": frozenset({"restore"}),
     "shared-epoch-at-robot": frozenset({"restore"}),

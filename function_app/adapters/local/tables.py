@@ -6,12 +6,11 @@ batch atomic. ``table_file`` describes how damage is detected.
 """
 
 import asyncio
-import contextlib
 import logging
 import os
 import sqlite3
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +45,8 @@ _QUERY_CLOSED = _QUERY.format(last="AND key<?")
 
 _DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_ERROR})
 """SQLite's codes for a damaged file; the last one for a missing table."""
+_SQLITE_ERRORS = (sqlite3.Error, UnicodeError)
+"""SQLite's message may quote damaged text, which Python cannot decode."""
 _log = logging.getLogger(__name__)
 
 
@@ -122,8 +123,10 @@ class SqliteTables:
 
     async def remove_damaged(self) -> Path | None:
         """Move all damaged rows to a file next to the tables; returns the file, or ``None`` without damaged rows."""
-        with self._reporting():
+        try:
             kept = await asyncio.to_thread(table_file.remove_damaged_rows, self._path)
+        except _SQLITE_ERRORS as error:
+            raise self._explained(error) from error
         self._found = ()
         return kept
 
@@ -184,25 +187,26 @@ class SqliteTables:
 
     def _run(self, statement: str, values: tuple[Any, ...] = ()) -> sqlite3.Cursor:
         db = self._db or self._open()
-        with self._reporting():
+        try:
             return db.execute(statement, values)
+        except _SQLITE_ERRORS as error:
+            raise self._explained(error) from error
 
     def _read(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
         db = self._db or self._open()
         self._require_same_file()
-        with self._reporting():
-            return db.execute(statement, values).fetchall()
-
-    @contextlib.contextmanager
-    def _reporting(self) -> Iterator[None]:
         try:
-            yield
-        except sqlite3.IntegrityError:
-            raise
-        except UnicodeEncodeError as error:
-            raise ValueError("partitions and keys are Unicode text without lone surrogates") from error
-        except (sqlite3.Error, UnicodeDecodeError) as error:  # SQLite's message may quote damaged text
-            raise self._unusable(error) from error
+            return db.execute(statement, values).fetchall()
+        except _SQLITE_ERRORS as error:
+            raise self._explained(error) from error
+
+    def _explained(self, error: Exception) -> Exception:
+        """The error to raise instead."""
+        if isinstance(error, sqlite3.IntegrityError):
+            return error
+        if isinstance(error, UnicodeEncodeError):
+            return ValueError("partitions and keys are Unicode text without lone surrogates")
+        return self._unusable(error)
 
     def _require_same_file(self) -> None:
         if self._db is not None and table_file.identity(self._path) != self._file:
