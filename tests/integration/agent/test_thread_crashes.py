@@ -99,7 +99,7 @@ class MovingAgent(AgentProcess):
         """Supervise the agent until the condition holds."""
         deadline_s = time.monotonic() + PATIENCE_S
         while not condition():
-            assert time.monotonic() < deadline_s, what
+            assert time.monotonic() < deadline_s, f"{what}; {self.received(topics.ACK, Ack)[-3:]}"
             self.check()
             time.sleep(CHECK_PERIOD_S / 4)
 

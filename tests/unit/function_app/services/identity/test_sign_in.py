@@ -46,7 +46,7 @@ def test_the_same_name_is_the_same_account_with_one_space(cloud: Cloud) -> None:
     one, two = cloud.sign_in("anna"), cloud.sign_in("anna")
     assert one.account == two.account
     assert one.session != two.session
-    me = {"id": one.account, "name": "anna", "session": one.session, "csrf_token": None}
+    me = {"id": one.account, "name": "anna", "session": one.session, "csrf_token": None, "administrator": False}
     storage = {"device_limit_bytes": 10_000_000_000, "devices": {}, "limit_bytes": 20_000_000_000, "used_bytes": 0}
     assert one.get("/accounts/me").json() == {**me, "storage": storage}
     (space,) = one.get("/spaces").json()["items"]
