@@ -66,6 +66,7 @@ class SupervisedThread:
         self._stopping = stopping
         self._within_s = within_s
         self._thread: threading.Thread | None = None
+        self._starting = False
         self.name = name
         self.part = part
         self.recovery = recovery
@@ -77,18 +78,22 @@ class SupervisedThread:
         """Start the thread, or start it again after it has ended."""
         self.error = None
         self.beat()
+        self._starting = True  # so that the supervisor does not take a thread that does not run yet for an ended one
         self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
         with _lock:
             _started.add(self)
-        self._thread.start()
+        try:
+            self._thread.start()
+        finally:
+            self._starting = False
 
     def beat(self, within_s: float | None = None) -> None:
         """Report progress. The next report follows within this time [s], by default that of the thread."""
         self.last = Beat(time.monotonic(), self._within_s if within_s is None else within_s)
 
     def is_alive(self) -> bool:
-        """Whether the thread runs."""
-        return self._thread is not None and self._thread.is_alive()
+        """Whether the thread runs or is being started."""
+        return self._thread is not None and (self._starting or self._thread.is_alive())
 
     def is_current(self) -> bool:
         """Whether the caller runs in this thread."""
@@ -107,7 +112,7 @@ class SupervisedThread:
     @property
     def failed(self) -> bool:
         """Whether the thread has ended unexpectedly."""
-        if self._thread is None or self._thread.is_alive():
+        if self._thread is None or self.is_alive():
             return False
         return self.error is not None if self._stopping is None else not self._stopping.is_set()
 

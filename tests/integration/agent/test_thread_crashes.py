@@ -77,8 +77,10 @@ class MovingAgent(AgentProcess):
         self.wait(lambda: self.speed() > MOVING, "motion")
         if self.robot in CAMERAS:
             self.wait(lambda: "renderer" in self.threads(), "a frame of the camera")
+        # The second list is taken first: a thread that ends in between is in neither.
+        watched = {thread.name for thread in threads.watched()}
         running = {thread.name for thread in set(threading.enumerate()) - self.others}
-        assert running <= {thread.name for thread in threads.watched()}
+        assert running <= watched, self.received(topics.ACK, Ack)[-3:]
 
     def close(self) -> None:
         self.agent.stop()
