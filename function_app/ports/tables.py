@@ -41,7 +41,7 @@ RELAXED: Final = frozenset(
 )
 """Tables whose last writes may be lost when the machine loses power: measurements, and what is written again or before
 the row that needs it. A store keeps the order of writes: a later durable write makes them durable, too."""
-_RELAXED_KEYS: Final = {"Agents": ("link", "state:"), "Control": ("event:",)}
+_RELAXED_KEYS: Final = {"Agents": ("link", "state:"), "Control": ("event:", "now:epochs")}
 """Key prefixes of rows that agents report again after each connection, and of events whose deletion is repeated."""
 
 

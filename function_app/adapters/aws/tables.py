@@ -156,7 +156,6 @@ class DynamoTables:
         await self._client.close()
 
     async def _put(self, table: str, write: Write) -> Row:
-        row_codec.check(write.row)
         row = _written(write)
         change = _change(table, write, row, row_codec.encode(row))["Put"]
         try:

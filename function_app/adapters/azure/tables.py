@@ -67,14 +67,12 @@ class AzureTables:
         return None if entity is None else _row(partition, entity)
 
     async def create(self, table: str, row: Row) -> Row:
-        row_codec.check(row)
         entity = _entity(row, row_codec.encode(row))
         return await self._put(table, row, entity, lambda to: to.create_entity(entity, retry_on_methods=_RETRIED))
 
     async def replace(self, table: str, row: Row) -> Row:
-        row_codec.check(row)
-        _check_etag(table, row)
         entity = _entity(row, row_codec.encode(row))
+        _check_etag(table, row)
         return await self._put(
             table, row, entity, lambda to: to.update_entity(entity, **_if_match(row), **_REPLACE), create_table=False
         )

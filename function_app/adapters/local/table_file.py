@@ -7,7 +7,6 @@ compared with what SQLite has read from it. Each row contains a checksum, becaus
 import contextlib
 import json
 import os
-import secrets
 import shutil
 import sqlite3
 import struct
@@ -17,11 +16,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from function_app.ports.tables import StoreError
+import msgspec
+
+from function_app.adapters.shared import row_codec
+from function_app.ports.tables import Row, StoreError
 
 FILE_NAME: Final = "tables.sqlite"
 """Name of the file in an installation's folder."""
-_NONCE_LENGTH: Final = 16
+NONCE_BYTES: Final = 8
+"""Random bytes at the beginning of an ETag, in hexadecimal."""
+_NONCE_LENGTH: Final = 2 * NONCE_BYTES
 _ETAG_LENGTH: Final = 24
 _WAL_HEADER: Final = struct.Struct(">8I")
 _FRAME_HEADER: Final = struct.Struct(">6I")
@@ -35,9 +39,6 @@ _MAX_SHOWN: Final = 5
 _BYTES: Final = "surrogateescape"
 """Keeps bytes that are not UTF-8."""
 _RAW: Final = "{} rows WHERE CAST(tab AS BLOB)=? AND CAST(part AS BLOB)=? AND CAST(key AS BLOB)=?"
-
-FileId = tuple[tuple[int, int], tuple[int, int]]
-"""Device and inode of the database and of its log."""
 
 
 class RowKey(NamedTuple):
@@ -58,39 +59,24 @@ class DamagedRowError(StoreError):
         )
 
 
-def new_etag(place: RowKey, data: bytes) -> str:
-    """A new ETag, which ends with the checksum of the row."""
-    nonce = secrets.token_hex(_NONCE_LENGTH // 2)
-    return nonce + _checksum(place, nonce, data)
-
-
-def require_intact(place: RowKey, etag: Any, data: Any) -> bytes:
-    """The data of a row. Rows of earlier versions have no checksum.
+def decode(place: RowKey, etag: Any, data: Any) -> Row:
+    """A stored row. Rows of earlier versions have no checksum.
 
     Raises:
         DamagedRowError: The data or the ETag differ from what was written.
     """
     content = data.encode() if isinstance(data, str) else data
     if isinstance(etag, str) and isinstance(content, bytes):
-        if len(etag) == _NONCE_LENGTH:
-            return content
         nonce = etag[:_NONCE_LENGTH]
-        if len(etag) == _ETAG_LENGTH and etag[_NONCE_LENGTH:] == _checksum(place, nonce, content):
-            return content
+        if etag == nonce or etag == nonce + checksum(place, nonce, content):
+            with contextlib.suppress(msgspec.DecodeError):
+                return row_codec.decode(place.partition, place.key, content, etag)
     raise DamagedRowError(place)
 
 
-def _checksum(place: RowKey, nonce: str, data: bytes) -> str:
+def checksum(place: RowKey, nonce: str, data: bytes) -> str:
+    """The checksum of a row, which follows the nonce in its ETag: eight hexadecimal digits."""
     return f"{zlib.crc32(data, zlib.crc32(chr(0).join((*place, nonce)).encode(errors=_BYTES))):08x}"
-
-
-def identity(path: Path) -> FileId | None:
-    """Which files the path names now; ``None`` if one is missing."""
-    try:
-        tables, log = os.stat(path), os.stat(f"{path}-wal")  # noqa: PTH116 (precedes each statement)
-    except OSError:
-        return None
-    return (tables.st_dev, tables.st_ino), (log.st_dev, log.st_ino)
 
 
 def log_of(path: Path) -> Path:
@@ -205,7 +191,7 @@ def _damaged_rows(database: sqlite3.Connection) -> Iterator[RowKey]:
         place = RowKey(str(table), str(partition), str(key))
         order = tuple(text.encode(errors=_BYTES) for text in place)
         try:
-            require_intact(place, etag, data)
+            decode(place, etag, data)
         except DamagedRowError:
             yield place
         else:

@@ -8,18 +8,17 @@ batch atomic. ``table_file`` describes how damage is detected.
 import asyncio
 import logging
 import os
+import secrets
 import sqlite3
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from function_app.adapters.local import table_file
-from function_app.adapters.local.table_file import DamagedRowError, FileId, RowKey
+from function_app.adapters.local.table_file import RowKey
 from function_app.adapters.shared import row_codec
-from function_app.ports.tables import Conflict, Page, Row, StoreError, StoreFullError, Write, is_durable
+from function_app.ports.tables import RELAXED, Conflict, Page, Row, StoreError, StoreFullError, Write, is_durable
 
 FORMAT = 1
 """Format of the file (``user_version``). 0: written by a version without checksums, or new."""
@@ -62,13 +61,15 @@ class SqliteTables:
         self._path = path
         self._max_bytes = max_bytes
         self._db: sqlite3.Connection | None = None
-        self._file: FileId | None = None
+        self._log = table_file.log_of(path)
+        self._files: tuple[int, int, int, int] | None = None
+        """Device and inode of the file and of its log since the file was opened."""
         self._synchronous = _NORMAL
         self._found: tuple[str, ...] = ()
 
     async def get(self, table: str, partition: str, key: str) -> Row | None:
         found = self._read(_GET, (table, partition, key))
-        return _row(RowKey(table, partition, key), *found[0]) if found else None
+        return table_file.decode(RowKey(table, partition, key), *found[0]) if found else None
 
     async def create(self, table: str, row: Row) -> Row:
         return self._write_one(table, Write("create", row))
@@ -95,7 +96,9 @@ class SqliteTables:
             found = self._read(_QUERY_OPEN, (table, partition, start, limit + 1))
         else:
             found = self._read(_QUERY_CLOSED, (table, partition, start, last, limit + 1))
-        page = tuple([_row(RowKey(table, partition, key), etag, data) for key, etag, data in found[:limit]])
+        page = tuple(
+            [table_file.decode(RowKey(table, partition, key), etag, data) for key, etag, data in found[:limit]]
+        )
         return Page(page, row_codec.write_cursor(found[limit][0]) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
@@ -116,7 +119,8 @@ class SqliteTables:
             self._found = tuple(await asyncio.to_thread(lambda: list(table_file.damage(self._path))))
         problems = [*table_file.kept_files(self._path), *self._found]
         try:
-            self._require_same_file()
+            if self._db is not None:
+                self._require_same_file()
         except StoreError as error:
             problems.append(str(error))
         return tuple(problems)
@@ -145,14 +149,19 @@ class SqliteTables:
             self._db = None
 
     def _write_one(self, table: str, write: Write) -> Row:
-        row_codec.check(write.row)
+        if write.kind == "delete":
+            row_codec.check(write.row)
         data = b"" if write.kind == "delete" else row_codec.encode(write.row)
         self._prepare_write(table, (write,))
         return self._write(table, write, data)
 
     def _prepare_write(self, table: str, writes: Sequence[Write]) -> None:
         """Choose when the write must be on disk. A durable commit also writes all earlier ones."""
-        level = _FULL if any(is_durable(table, write.row.key) for write in writes) else _NORMAL
+        level = _NORMAL
+        for write in writes:
+            if table not in RELAXED and is_durable(table, write.row.key):
+                level = _FULL
+                break
         if self._db is None:
             self._open()
         self._require_same_file()
@@ -162,24 +171,23 @@ class SqliteTables:
 
     def _write(self, table: str, write: Write, data: bytes) -> Row:
         row = write.row
+        place = RowKey(table, row.partition, row.key)
         if write.kind == "delete":
-            self._expect_one(self._run(_DELETE, (table, row.partition, row.key, row.etag)), table, row)
-            return row
-        etag = table_file.new_etag(RowKey(table, row.partition, row.key), data)
-        if write.kind == "create":
-            try:
-                self._run(_CREATE, (table, row.partition, row.key, etag, data))
-            except sqlite3.IntegrityError as error:
-                raise Conflict(f"{table}: '{row.key}' exists") from error
+            cursor, written = self._run(_DELETE, (*place, row.etag)), row
         else:
-            cursor = self._run(_REPLACE, (etag, data, table, row.partition, row.key, row.etag))
-            self._expect_one(cursor, table, row)
-        return Row(row.partition, row.key, row.data, etag, row.schema)
-
-    @staticmethod
-    def _expect_one(cursor: sqlite3.Cursor, table: str, row: Row) -> None:
+            nonce = secrets.token_hex(table_file.NONCE_BYTES)
+            etag = nonce + table_file.checksum(place, nonce, data)
+            written = Row(row.partition, row.key, row.data, etag, row.schema)
+            if write.kind == "replace":
+                cursor = self._run(_REPLACE, (etag, data, *place, row.etag))
+            else:
+                try:
+                    cursor = self._run(_CREATE, (*place, etag, data))
+                except sqlite3.IntegrityError as error:
+                    raise Conflict(f"{table}: '{row.key}' exists") from error
         if cursor.rowcount != 1:
             raise Conflict(f"{table}: '{row.key}' does not have the expected ETag")
+        return written
 
     def _rollback(self) -> None:
         if self._db is not None and self._db.in_transaction:
@@ -209,7 +217,14 @@ class SqliteTables:
         return self._unusable(error)
 
     def _require_same_file(self) -> None:
-        if self._db is not None and table_file.identity(self._path) != self._file:
+        # Not split further, because it precedes each read and write.
+        try:
+            tables, log = os.stat(self._path), os.stat(self._log)  # noqa: PTH116
+            files: tuple[int, int, int, int] | None = (tables.st_dev, tables.st_ino, log.st_dev, log.st_ino)
+        except OSError:
+            files = None  # one is missing
+        self._files = self._files or files
+        if files is None or files != self._files:
             raise StoreError(
                 f"the tables in {self._path} were replaced or deleted while the server runs. Stop the server, restore "
                 "a backup if necessary, and start it again."
@@ -246,7 +261,8 @@ class SqliteTables:
             db.close()
             raise
         self._db, self._synchronous = db, _NORMAL
-        self._file = table_file.identity(self._path)
+        self._files = None
+        self._require_same_file()
         return db
 
     def _unusable(self, error: Exception) -> StoreError:
@@ -262,13 +278,6 @@ class SqliteTables:
             f"the tables in {self._path} are damaged ({error}). Restore a backup, or move the file away to start with "
             "empty tables; no data were deleted."
         )
-
-
-def _row(place: RowKey, etag: Any, data: Any) -> Row:
-    try:
-        return row_codec.decode(place.partition, place.key, table_file.require_intact(place, etag, data), etag)
-    except msgspec.DecodeError as error:
-        raise DamagedRowError(place) from error
 
 
 def _prepare(db: sqlite3.Connection, path: Path) -> None:

@@ -20,7 +20,7 @@ _decode = msgspec.json.Decoder(dict[str, Any]).decode
 
 
 def check(row: Row) -> None:
-    """Check the partition and key of a row.
+    """Check the partition and key of a row to delete; ``encode`` checks those to write.
 
     Raises:
         ValueError: One is empty, too long, or contains a lone surrogate.
@@ -48,7 +48,8 @@ def check_batch(writes: Sequence[Write]) -> tuple[bytes, ...]:
         if write.row.key in keys:
             raise ValueError("a batch writes each key once")
         keys.add(write.row.key)
-        check(write.row)
+        if write.kind == "delete":
+            check(write.row)
         texts.append(b"" if write.kind == "delete" else encode(write.row))
     size = sum(map(len, texts)) - _SCHEMA_BYTES * sum(map(bool, texts))
     if size > MAX_BATCH_BYTES:
@@ -67,11 +68,14 @@ def check_limit(limit: int) -> None:
 
 
 def encode(row: Row) -> bytes:
-    """A row's data and schema version as JSON.
+    """A row's data and schema version as JSON, after a check of its partition and key.
 
     Raises:
-        ValueError: More than ``MAX_DATA_BYTES``.
+        ValueError: More than ``MAX_DATA_BYTES``, or an invalid partition or key; see ``check``.
     """
+    usual = row.partition.isascii() and row.key.isascii()
+    if not (usual and 0 < len(row.partition) <= MAX_KEY_LENGTH and 0 < len(row.key) <= MAX_KEY_LENGTH):
+        check(row)
     text = _encode(row.data)
     if len(text) > MAX_DATA_BYTES:
         raise ValueError(f"a row holds at most {MAX_DATA_BYTES} bytes, not {len(text)}")

@@ -219,14 +219,18 @@ class LastState:
     pairing: str = ""
 
     @property
-    def epoch(self) -> int:
-        """The highest epoch that the device has seen."""
-        return int(self.state.get("epoch", 0))
-
-    @property
     def ended_epoch(self) -> int:
         """The highest epoch that the device has ended."""
         return int(self.state.get("ended_epoch", 0))
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceEpochs:
+    """The highest epochs that a device has reported in its ``state``: seen, and ended. ``pairing``: at that time."""
+
+    seen: int = 0
+    ended: int = 0
+    pairing: str = ""
 
 
 def online(link: Link | None, last_seen_ms: int, now_ms: int) -> bool:

@@ -65,7 +65,7 @@ class ActionAcks:
             raise ProtocolError(f"'{ack.id}' is not a command of {topic.agent}/{topic.device}")
         self._metrics.count(Counter.ACKS, ack.status)
         ack_report = report(ack, self._clock.now_ms())
-        if await self._queues.reissue(ack.id, ack_report.device_epoch):
+        if ack_report.device_epoch and await self._queues.reissue(ack.id, ack_report.device_epoch):
             return
         stored = await self._queues.change(ack.id, lambda action: apply_report(action, ack_report))
         if stored is None:
@@ -116,7 +116,8 @@ class ActionAcks:
             try:
                 async with asyncio.timeout(min(pause_s, left_s)):
                     reports.append(report(await anext(acks), self._clock.now_ms()))
-                rejected = await self._queues.reissue(action.id, reports[-1].device_epoch)
+                epoch = reports[-1].device_epoch
+                rejected = bool(epoch) and await self._queues.reissue(action.id, epoch)
                 if rejected:
                     reports.clear()
                 if rejected or action.status is Status.QUEUED:  # an ack means that the action has left the queue

@@ -76,15 +76,13 @@ class ActionQueues:
 
         Args:
             action: Id of a command.
-            device_epoch: Highest epoch of the device; 0: it was not rejected because of its epoch.
+            device_epoch: Highest epoch of the device, which the rejection names.
 
         Returns:
             Whether the command was issued, by this call or another process. Otherwise the rejection is final: the
             request named an epoch, the cloud has granted a newer lease, the device has ended the lease, or the
             command was issued again before.
         """
-        if not device_epoch:
-            return False
         issued = await records.retry(lambda: self._issue_again(action, device_epoch))
         if isinstance(issued, bool):
             return issued
@@ -241,7 +239,7 @@ class ActionQueues:
         if control.action or control.queue.position(stored.action.id) != 1:
             return None
         now_ms = self._clock.now_ms()
-        control = await apply_device_epochs(self._tables, device, control, caller, now_ms)
+        control = apply_device_epochs(control, caller, now_ms)
         lease = action_lease(
             control.lease,
             caller,

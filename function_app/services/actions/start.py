@@ -243,7 +243,7 @@ class StartAction:
         async def attempt() -> tuple[StoredAction, bool]:
             now_ms = self._clock.now_ms()
             control = await read_control(self._tables, device)
-            control = await apply_device_epochs(self._tables, device, control, caller, now_ms)
+            control = apply_device_epochs(control, caller, now_ms)
             if now_ms - draft.created_ms > ABANDON_MS:
                 raise busy_store()
             existing = await self._existing(device, request, draft.idempotency_key) if draft.idempotency_key else None

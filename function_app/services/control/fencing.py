@@ -11,7 +11,7 @@ from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.control.control_events import event_writes
-from function_app.services.devices.control_rows import device_epoch, read_control_rows
+from function_app.services.devices.control_rows import read_control_rows
 from function_app.services.identity.authenticator import everything
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.storage import records
@@ -53,7 +53,7 @@ class ControlRevocation:
             if account not in {None, existing.account}:
                 return None
             now_ms = self._clock.now_ms()
-            newest = catch_up(existing, await device_epoch(self._tables, device), now_ms=now_ms) or existing
+            newest = catch_up(existing, control.reported.seen, now_ms=now_ms) or existing
             lease = Lease(epoch=newest.epoch + 1, pairing=device.pairing)
             fact = control_ended(existing, lease, why=why, now_ms=now_ms)
             facts = event_writes(device.id, device.pairing, [fact], owner=device.owner)

@@ -34,7 +34,7 @@ class LeaseStore:
             nonlocal watched
             control = await read_control(self._tables, device)
             now_ms = self._clock.now_ms()
-            control = await apply_device_epochs(self._tables, device, control, caller, now_ms, reported=device_epoch)
+            control = apply_device_epochs(control, caller, now_ms, rejected=device_epoch)
             lease = change(control.lease, now_ms)
             if lease is control.lease:
                 return lease, lease

@@ -18,7 +18,7 @@ from function_app.ports.tables import Tables
 from function_app.services.control.control_events import ControlEvents
 from function_app.services.control.fencing import ControlRevocation
 from function_app.services.control.lease_store import LeaseStore
-from function_app.services.devices.control_rows import ended_by_device, read_lease
+from function_app.services.devices.control_rows import read_control
 from function_app.services.devices.device_access import DeviceAccess, require_operator, require_owner
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.messaging.delivery import Confirmation
@@ -69,10 +69,11 @@ class Leases:
     async def get(self, caller: Identity, device_id: str) -> Lease | None:
         """The live lease of a device, unless the device has ended it. Raises ``device-unknown``."""
         device = await self._devices.get(caller, device_id)
-        lease = await read_lease(self._tables, device)
+        control = await read_control(self._tables, device)
+        lease = control.lease
         if lease is None or not lease.is_live(self._clock.now_ms()):
             return None
-        return None if await ended_by_device(self._tables, device, lease) else lease
+        return None if control.reported.ended >= lease.epoch else lease
 
     async def acquire(
         self, caller: Identity, device_id: str, *, epoch: int | None, lease_ms: int, wait_ms: int, over: str = ""

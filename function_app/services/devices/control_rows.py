@@ -1,10 +1,10 @@
-"""The rows that control a device: lease, slot and queue in the device's partition."""
+"""The rows that control a device: lease, slot, queue and reported epochs in the device's partition."""
 
 from dataclasses import dataclass, field, replace
 
 from function_app.domain.actions.queue import ActionQueue
 from function_app.domain.control.lease import Lease, catch_up, release
-from function_app.domain.devices.devices import Device, LastState
+from function_app.domain.devices.devices import Device, DeviceEpochs
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.storage import records
@@ -12,16 +12,18 @@ from function_app.services.storage import records
 LEASE = "now:lease"
 SLOT = "now:slot"
 QUEUE = "now:queue"
+EPOCHS = "now:epochs"
 
 
 @dataclass(frozen=True, slots=True)
 class ControlRows:
-    """Lease, slot and queue with the rows that they were read from (missing: not written yet)."""
+    """Lease, slot, queue and reported epochs with the rows that they were read from (missing: not written yet)."""
 
     lease: Lease | None = None
     action: str = ""
     slot_pairing: str = ""
     queue: ActionQueue = field(default_factory=lambda: ActionQueue(""))
+    reported: DeviceEpochs = field(default_factory=DeviceEpochs)
     rows: dict[str, Row] = field(default_factory=dict)
 
     def write_lease(self, device: str, lease: Lease) -> Write:
@@ -41,7 +43,7 @@ class ControlRows:
 
 
 async def read_control(tables: Tables, device: Device) -> ControlRows:
-    """Lease, slot and queue in one read, without those of an earlier pairing."""
+    """Lease, slot, queue and reported epochs in one read, without those of an earlier pairing."""
     rows = await _rows(tables, device.id)
     lease = _lease(rows, device)
     slot = rows.get(SLOT)
@@ -52,6 +54,7 @@ async def read_control(tables: Tables, device: Device) -> ControlRows:
         action=action,
         slot_pairing=device.pairing,
         queue=queue if queue.pairing == device.pairing else ActionQueue(device.pairing),
+        reported=_reported(rows, device.pairing),
         rows=rows,
     )
 
@@ -60,40 +63,27 @@ async def read_control_rows(tables: Tables, device: str) -> ControlRows:
     """Lease, slot and queue of any pairing."""
     rows = await _rows(tables, device)
     slot = rows.get(SLOT)
+    lease = records.read(rows[LEASE], Lease) if LEASE in rows else None
     return ControlRows(
-        lease=records.read(rows[LEASE], Lease) if LEASE in rows else None,
+        lease=lease,
         action=slot.data["action"] if slot else "",
         slot_pairing=slot.data["pairing"] if slot else "",
         queue=_queue(rows),
+        reported=_reported(rows, lease.pairing if lease is not None else ""),
         rows=rows,
     )
 
 
-async def apply_device_epochs(
-    tables: Tables, device: Device, control: ControlRows, caller: Identity, now_ms: int, *, reported: int = 0
-) -> ControlRows:
-    """The rows with the epochs of the device: those in its ``state``, and ``reported`` from a rejected command.
+def apply_device_epochs(control: ControlRows, caller: Identity, now_ms: int, *, rejected: int = 0) -> ControlRows:
+    """The rows of ``read_control`` with the epochs of the device: reported ones, and that of a ``rejected`` command.
 
     A hold, Stop or restart ends leases at the device: the lease of another session is then free. An ended epoch is
     never accepted again, so an old state is still valid. See also ``catch_up``.
     """
-    last = await _last_state(tables, device)
-    lease = catch_up(control.lease, max(reported, last.epoch if last else 0), now_ms=now_ms)
-    if lease is not None and lease.held_by_other(caller, now_ms) and last is not None:
-        lease = release(lease, now_ms=now_ms) if last.ended_epoch >= lease.epoch else lease
+    lease = catch_up(control.lease, max(rejected, control.reported.seen), now_ms=now_ms)
+    if lease is not None and control.reported.ended >= lease.epoch and lease.held_by_other(caller, now_ms):
+        lease = release(lease, now_ms=now_ms)
     return control if lease is control.lease else replace(control, lease=lease)
-
-
-async def device_epoch(tables: Tables, device: Device) -> int:
-    """The highest epoch in the ``state`` of the device; 0 if unknown."""
-    last = await _last_state(tables, device)
-    return last.epoch if last is not None else 0
-
-
-async def ended_by_device(tables: Tables, device: Device, lease: Lease) -> bool:
-    """Whether the device has ended this lease."""
-    last = await _last_state(tables, device)
-    return last is not None and last.ended_epoch >= lease.epoch
 
 
 async def read_lease(tables: Tables, device: Device) -> Lease | None:
@@ -102,9 +92,18 @@ async def read_lease(tables: Tables, device: Device) -> Lease | None:
     return _lease({LEASE: row} if row else {}, device)
 
 
-async def _last_state(tables: Tables, device: Device) -> LastState | None:
-    _, last = await records.find(tables, records.AGENTS, device.agent, f"state:{device.name}", LastState)
-    return last if last is not None and last.pairing == device.pairing else None
+async def record_device_epochs(tables: Tables, device: str, epochs: DeviceEpochs) -> None:
+    """Store the epochs of the newest ``state`` where ``read_control`` finds them."""
+
+    def changed(stored: DeviceEpochs | None) -> DeviceEpochs | None:
+        return None if stored == epochs else epochs
+
+    await records.upsert(tables, records.CONTROL, device, EPOCHS, changed, DeviceEpochs)
+
+
+def _reported(rows: dict[str, Row], pairing: str) -> DeviceEpochs:
+    reported = records.read(rows[EPOCHS], DeviceEpochs) if EPOCHS in rows else DeviceEpochs()
+    return reported if reported.pairing == pairing else DeviceEpochs()
 
 
 async def _rows(tables: Tables, device: str) -> dict[str, Row]:

@@ -14,10 +14,11 @@ from function_app.domain.audit.hash_chain import CLOUD, Entry
 from function_app.domain.common.ids import device_id
 from function_app.domain.common.json_depth import MAX_LEVELS, too_deep
 from function_app.domain.common.timestamps import LAST_MS
-from function_app.domain.devices.devices import Agent, LastState, Link, Transport, newer_link
+from function_app.domain.devices.devices import Agent, DeviceEpochs, LastState, Link, Transport, newer_link
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.audit.audit_log import AuditLog
+from function_app.services.devices.control_rows import record_device_epochs
 from function_app.services.health.reported_faults import ReportedFaults
 from function_app.services.messaging.key_announcer import KeyAnnouncer
 from function_app.services.storage import records
@@ -86,6 +87,8 @@ class PresenceIngest:
         elif topic.kind == topics.STATE:
             state = codec.decode(payload, State)
             await self._reported_faults.on_state(agent, topic.device, state)
+            epochs = DeviceEpochs(state.epoch, state.ended_epoch, agent.pairing)
+            await record_device_epochs(self._tables, device_id(topic.agent, topic.device), epochs)
             last_state = LastState(msgspec.to_builtins(state), now_ms, agent.pairing)
             await records.upsert(
                 self._tables, records.AGENTS, topic.agent, f"state:{topic.device}", lambda _: last_state, LastState

@@ -10,11 +10,8 @@ from function_app.adapters.local.signing_keys import FileKeys
 from tests.harness.cloud.cloud import API, MOVE, Cloud, settings
 from tests.harness.network.brokers import start_broker
 
-MAX_CALLS = 355
-"""Calls and coroutine resumptions in ``function_app`` and ``device_agent`` until the action has started.
-
-About fifty of them check rows and the file of the tables: a checksum for each row, a durable commit, the same file.
-"""
+MAX_CALLS = 300
+"""Calls and coroutine resumptions in ``function_app`` and ``device_agent`` until the action has started."""
 MAX_MATCHES = 3
 PACKAGES = ("/function_app/", "/device_agent/")
 
