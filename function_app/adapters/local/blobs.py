@@ -164,8 +164,7 @@ class FileBlobs:
     async def _write(self, path: Path, content: AsyncIterator[bytes], max_length: int) -> int:
         """Write at most ``max_length`` bytes of the content; returns the number of received bytes."""
         length = 0
-        file = await asyncio.to_thread(path.open, "xb")
-        try:
+        with await asyncio.to_thread(path.open, "xb") as file:
             async for part in content:
                 length += len(part)
                 if length > max_length:
@@ -174,8 +173,6 @@ class FileBlobs:
                     raise TransferRefused(507, "The server's disk is almost full. Upload the content again later.")
                 await asyncio.to_thread(file.write, part)
             await asyncio.to_thread(_flush, file)
-        finally:
-            await asyncio.to_thread(file.close)
         return length
 
     async def close(self) -> None:
@@ -242,11 +239,10 @@ class FileBlobs:
 
 
 async def _parts(file: BinaryIO) -> AsyncIterator[bytes]:
-    try:
+    # Closed without waiting: in a cancelled request each wait is cancelled, too.
+    with file:
         while part := await asyncio.to_thread(file.read, _READ_BYTES):
             yield part
-    finally:
-        await asyncio.to_thread(file.close)
 
 
 def _flush(file: BinaryIO) -> None:

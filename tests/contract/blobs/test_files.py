@@ -5,7 +5,9 @@ import base64
 import socket
 from collections.abc import AsyncIterator, Awaitable
 from pathlib import Path
+from typing import IO, Any
 
+import anyio
 import httpx
 import pytest
 import uvicorn
@@ -76,3 +78,23 @@ async def test_an_unusable_folder_is_named(blobs: Blobs, tmp_path: Path) -> None
             await call
         assert str(tmp_path / "blobs") in str(caught.value)
         assert "\n" not in str(caught.value)
+
+
+async def test_a_cancelled_download_closes_the_file(blobs: FileBlobs, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the framework cancels it when the client closes the connection: each further wait is cancelled, too."""
+    await blobs.put("a", bytes(3_000_000))
+    url = await blobs.presign_download("a", content_type="image/png", lifetime_s=60)
+    files: list[IO[Any]] = []
+    original = Path.open
+
+    def opened(*arguments: Any) -> IO[Any]:
+        files.append(original(*arguments))
+        return files[-1]
+
+    monkeypatch.setattr(Path, "open", opened)
+    download = await blobs.send(url.rpartition("/")[2])
+    with anyio.CancelScope() as scope:
+        async for _ in download.content:
+            scope.cancel()
+    assert scope.cancelled_caught
+    assert [file.closed for file in files] == [True]
