@@ -13,10 +13,6 @@ from tests.simulation.shrink import shrink
 from tests.simulation.world import World
 
 PENDING: dict[str, frozenset[str]] = {
-    "blocked (lease)": frozenset({"restore"}),
-    "blocked (reset)": frozenset({"restore"}),
-    "shared-epoch-at-robot": frozenset({"restore"}),
-    "foreign-setpoint": frozenset({"restore"}),
     "blocked (device-busy)": frozenset({"cloud_clock"}),
     "not-terminal (clock)": frozenset({"cloud_clock"}),
     "not-terminal": frozenset({"full_disk"}),

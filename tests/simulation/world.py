@@ -13,6 +13,7 @@ from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent as AgentRow
 from function_app.domain.identity.accounts import Role
 from function_app.services.actions.requests import ActionRequest
+from function_app.services.storage import records
 from tests.fakes.clock import MemoryClock
 from tests.fakes.event_loop import VirtualTimeLoop
 from tests.simulation.actors.agent import AgentMachine
@@ -211,6 +212,13 @@ class World:
         """Start the worker."""
         self.worker = self._start("worker")
         self.worker.start_worker()
+
+    async def settle_restore(self) -> None:
+        """Prepare restored tables, as ``telescope-server restore`` does before the server starts."""
+        command = self._start("restore")
+        agents = sorted({row.partition for _, row in self.stores.tables.rows(records.AGENTS)})
+        await command.spawn(command.functions.restored_backup.settle(created_ms=0, agents=agents))
+        command.kill()
 
     def _start(self, name: str) -> Instance:
         instance = Instance(name, self.stores, self.broker, self.rng(name), crashed=self._crashed)

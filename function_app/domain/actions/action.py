@@ -57,6 +57,11 @@ JOURNAL_MS = 7 * 24 * 3_600_000
 Without this limit, an agent that has deleted the outcome would report an executed command as expired.
 """
 
+NO_REPORT = (
+    "The device has not reported how the action ended; it may have executed it. Check the device. The result appears "
+    "here when the device reports it."
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Action:
@@ -190,7 +195,8 @@ def give_turn(action: Action, epoch: int, now_ms: int) -> Action:
 
 def may_reissue(action: Action, device_epoch: int) -> bool:
     """Whether the command, which the device rejected because of its epoch, may be issued with a higher one."""
-    return action.reissuable and not action.status.terminal and device_epoch >= action.epoch > 0
+    open_ = not action.status.terminal and action.status is not Status.UNKNOWN
+    return action.reissuable and open_ and device_epoch >= action.epoch > 0
 
 
 def reissue(action: Action, epoch: int, now_ms: int) -> Action:

@@ -98,6 +98,8 @@ class Lease:
 
 MIN_MS = 1_000
 """Shortest lease [ms]."""
+RESTORE_JUMP = 2**20
+"""More grants than a device gets between a backup and its restore: one per second for twelve days."""
 MAX_EPOCH_JUMP = 2**24
 """Highest increase of an epoch to that of a device, because its reports are not signed.
 
@@ -181,6 +183,15 @@ def invalidate(lease: Lease | None, *, pairing: str, now_ms: int) -> Lease:
     if lease is None:
         return Lease(epoch=1, pairing=pairing)
     return Lease(epoch=lease.epoch + 1, pairing=pairing, request=lease.closed_request(now_ms))
+
+
+def after_restore(lease: Lease | None, *, pairing: str, now_ms: int) -> Lease:
+    """A free lease with an epoch above all that were granted after the backup, also those still on their way.
+
+    Otherwise two operators could hold the same epoch: one from before the restore, one from after it.
+    """
+    free = invalidate(lease, pairing=pairing, now_ms=now_ms)
+    return replace(free, epoch=free.epoch + RESTORE_JUMP)
 
 
 def lease_held(lease: Lease) -> Problem:

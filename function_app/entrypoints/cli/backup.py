@@ -121,7 +121,8 @@ def _restore(configuration: Settings, options: argparse.Namespace) -> int:
 
 async def _settle(configuration: Settings, created_ms: int) -> int:
     async with _functions(configuration) as functions:
-        return await functions.restored_backup.settle(created_ms=created_ms)
+        agents = table_file.partitions(configuration.home / archive.TABLES, records.AGENTS)
+        return await functions.restored_backup.settle(created_ms=created_ms, agents=agents)
 
 
 def _verify(configuration: Settings, options: argparse.Namespace) -> int:

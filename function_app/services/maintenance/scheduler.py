@@ -6,7 +6,7 @@ Run it every second in one or more processes; every job is idempotent and safe t
 import logging
 
 from device_agent.protocol import CancelAction
-from function_app.domain.actions.action import Action, NextStep, Status, end, next_check_ms, next_step
+from function_app.domain.actions.action import NO_REPORT, Action, NextStep, Status, end, next_check_ms, next_step
 from function_app.domain.actions.queue import DROPPED
 from function_app.domain.common.ids import CLAIM_ALPHABET
 from function_app.domain.common.problems import Problem
@@ -26,7 +26,6 @@ from function_app.services.audit.audit_log import AuditLog
 from function_app.services.control import control_events as control_events_
 from function_app.services.control.control_events import ControlEvents
 from function_app.services.health.reported_faults import ReportedFaults
-from function_app.services.maintenance.restored_backup import RESEND, RESEND_MS
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.pairing.offboarding import Offboarding, offboarding_of
 from function_app.services.robot_types.cleanup import RobotTypeCleanup
@@ -44,10 +43,6 @@ KEEP_ONCE_MS = DAY_MS
 """Validity of an idempotency key: one day."""
 TIME_LIMIT = "the time limit"
 """Caller of the cancellation at a deadline, as the action's reason names it."""
-NO_REPORT = (
-    "The device has not reported how the action ended; it may have executed it. Check the device. The result appears "
-    "here when the device reports it."
-)
 LOST = "The device did not report within a week how the action ended. Check the device."
 _ENDING = frozenset({NextStep.ENDED, NextStep.LOSE, NextStep.DOUBT, NextStep.EXPIRE})
 _HEX = "0123456789abcdef"
@@ -106,7 +101,6 @@ class Scheduler:
             control_events_.REMINDER: control_events.check,
             audit_log_.REMINDER: audit_log.check,
             audit_log_.ANCHOR_REMINDER: audit_log.anchor,
-            RESEND: self._resend,
         }
 
     async def run_due_jobs(self, *, current: bool = True) -> None:
@@ -189,14 +183,6 @@ class Scheduler:
         if verdict is NextStep.DOUBT:
             return await self._end(result, Status.UNKNOWN, "no-report", NO_REPORT, now_ms)
         return await self._end(result, Status.EXPIRED, "queue-timeout", TIMEOUT, now_ms)
-
-    async def _resend(self, action_id: str) -> None:
-        """Send the command of an open action again after a restore; the device repeats its last ack."""
-        result = await self._action_store.get(action_id)
-        if result is None or result.action.status.terminal:
-            return
-        await self._reminders.schedule(f"{RESEND}:{action_id}", self._clock.now_ms() + RESEND_MS)
-        await self._publish(result, self._clock.now_ms())
 
     async def _check_queue(self, device: str, note: Row) -> None:
         """Advance a queue after its process may have been killed."""

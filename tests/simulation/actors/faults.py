@@ -193,6 +193,7 @@ class Faults:
         world.stores.tables.restore(backup)
         self.restored = True
         world.monitors.rows.restored(world.stores.tables)
+        await world.settle_restore()
         for index in range(len(world.instances)):
             world.start_function(index)
         world.start_worker()

@@ -1,13 +1,20 @@
 """Actions that were in progress when a backup was made end truthfully after it was restored."""
 
+from typing import TYPE_CHECKING, cast
+
 import pytest
 
 from device_agent.protocol import AckStatus, Command
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from function_app.domain.audit.hash_chain import Head
+from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person
 from tests.unit.function_app.services.actions.queue_requests import pass_time, queued, sent
 from tests.unit.function_app.services.control.test_restored_tables import Backup, Restore, backup, gate
+
+if TYPE_CHECKING:
+    from tests.fakes.tables import MemoryTables
 
 __all__ = ["backup", "gate"]
 
@@ -16,7 +23,9 @@ def settle(cloud: Cloud, restore: Restore) -> int:
     """Restore the tables, as the command does before the server starts."""
     created_ms = cloud.clock.now_ms()
     restore()
-    count = cloud.run(cloud.functions.restored_backup.settle(created_ms=created_ms))
+    tables = cast("MemoryTables", cloud.functions.tables)
+    agents = sorted({row.partition for _, row in tables.rows(records.AGENTS)})
+    count = cloud.run(cloud.functions.restored_backup.settle(created_ms=created_ms, agents=agents))
     cloud.sweep()
     return count
 
@@ -59,6 +68,21 @@ def test_an_action_without_an_answer_is_unknown_and_does_not_block(
     assert shown["status"] == "unknown"
     robot.silent = False
     assert anna.start(robot.device, wait_ms=20_000, wait_for="started").status_code == 200
+
+
+@pytest.mark.parametrize("granted_before", [False, True])
+def test_an_epoch_granted_before_the_restore_is_never_granted_again(
+    cloud: Cloud, anna: Person, robot: Robot, backup: Backup, granted_before: bool
+) -> None:
+    """Even if the device has not received the grant yet: both operators would hold the key of this epoch."""
+    if granted_before:
+        lease = anna.post(f"/devices/{robot.device}/lease", {"lease_ms": 10_000}).json()
+        anna.delete(f"/devices/{robot.device}/lease/{lease['epoch']}")
+    restore = backup()
+    lost = anna.post(f"/devices/{robot.device}/lease", {"lease_ms": 10_000}).json()["epoch"]
+    settle(cloud, restore)
+    robot.gate = LeaseGate()  # the device has not received any of them
+    assert anna.post(f"/devices/{robot.device}/lease", {"lease_ms": 10_000}).json()["epoch"] > lost
 
 
 def test_queued_actions_of_a_backup_do_not_start(cloud: Cloud, anna: Person, robot: Robot, backup: Backup) -> None:
