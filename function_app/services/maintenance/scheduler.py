@@ -7,7 +7,6 @@ import logging
 
 from device_agent.protocol import CancelAction
 from function_app.domain.actions.action import NO_REPORT, Action, NextStep, Status, end, next_check_ms, next_step
-from function_app.domain.actions.queue import DROPPED
 from function_app.domain.common.ids import CLAIM_ALPHABET
 from function_app.domain.common.problems import Problem
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
@@ -231,14 +230,9 @@ class Scheduler:
         try:
             await self._dispatcher.send(result, device)
         except (MovementUnavailable, PermissionEnded) as error:
-            if Status.PUBLISHED.value in result.action.times:
-                return  # the device may have executed it; it is asked once the command has expired
-            if isinstance(error, PermissionEnded):
-                status, message = DROPPED[error.why]
-                await self._end(result, status, error.why, message, now_ms)
-            else:
-                message = "The movement's script changed before the command was sent. Start it again."
-                await self._end(result, Status.FAILED, "movement-changed", message, now_ms)
+            # A request records its publication at its end, so the device may have the command already. It is asked
+            # once the command has expired.
+            _log.info("action %s is not sent again: %s", result.action.id, error)
 
     async def _ask(self, result: StoredAction, now_ms: int) -> None:
         """Ask the device for the outcome."""

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from device_agent.protocol import AckStatus, GrantLease, MoveJoints, ReleaseLease
+from function_app.domain.actions.action import Status
 from function_app.domain.devices.access import Share
 from function_app.domain.identity.accounts import Role
 from function_app.domain.identity.api_keys import ApiKey
@@ -89,7 +90,7 @@ class TestQueuedActions:
         cloud.sweep()
         assert anna.action(action)["status"] == "expired"
 
-    def test_an_unpublished_command_of_a_revoked_key_ends(
+    def test_an_unpublished_command_of_a_revoked_key_never_starts(
         self, cloud: Cloud, anna: Person, robot: Robot, broker: MemoryBroker
     ) -> None:
         _, program = make(anna)
@@ -100,9 +101,26 @@ class TestQueuedActions:
         tables.drop("ApiKeys")
         cloud.clock.advance(2)
         cloud.sweep()
-        ended = anna.action(action)
-        assert (ended["status"], ended["reason"]["code"]) == ("failed", "api-key-ended")
         assert action not in robot.payloads
+        cloud.clock.advance(10)
+        cloud.sweep()
+        assert anna.action(action)["status"] == "expired", "the device says that it has not started it"
+
+    def test_a_command_of_a_revoked_key_that_the_device_has_executed_is_done(
+        self, cloud: Cloud, anna: Person, robot: Robot
+    ) -> None:
+        """The request that has sent it has not recorded this yet: it waits for the robot."""
+        _, program = make(anna)
+        robot.silent = True
+        action = program.start(robot.device, ttl_ms=5_000).json()["id"]
+        store = cloud.functions.action_store
+        cloud.run(store.change(action, lambda stored: replace(stored, status=Status.CREATED, times={})))
+        tables: Any = cloud.functions.tables
+        tables.drop("ApiKeys")
+        cloud.clock.advance(2)
+        cloud.sweep()
+        robot.report(action, AckStatus.DONE)
+        assert anna.action(action)["status"] == "done"
 
 
 class TestGrants:
