@@ -15,8 +15,6 @@ from tests.simulation.world import World
 PENDING: dict[str, frozenset[str]] = {
     "blocked (device-busy)": frozenset({"cloud_clock"}),
     "not-terminal (clock)": frozenset({"cloud_clock"}),
-    "not-terminal": frozenset({"full_disk"}),
-    "thread-crashed": frozenset({"full_disk"}),
 }
 """Violations of known defects: kind → faults, of which the plan must contain one. Remove an entry with its defect."""
 BATCH = 25

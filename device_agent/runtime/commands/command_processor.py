@@ -319,7 +319,7 @@ class CommandProcessor:
 
     def _write_journal(self) -> None:
         """Journal delivered acks, and epochs and latch if they have changed."""
-        self._publisher.record_delivered()
+        self._publisher.update_journal()
         if self._controller.changed.is_set():
             self._controller.changed.clear()
             epoch, burned = self._controller.epochs

@@ -3,6 +3,7 @@
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -38,7 +39,7 @@ from device_agent.runtime.authority.event_recorder import EventRecord, event_mes
 from device_agent.runtime.authority.lease_gate import Lease
 from device_agent.runtime.control.base_motion import limits_of
 from device_agent.runtime.control.setpoint_stream import MAX_LOOP_AGE_S, WATCHDOG_S
-from device_agent.runtime.storage.journal import Journal
+from device_agent.runtime.storage.journal import Journal, JournalError
 from device_agent.runtime.telemetry.outbox import FIRST_REPEAT_S, LAST_REPEAT_S, Outbox, Publish
 from device_agent.runtime.telemetry.rate_meter import RateMeter
 
@@ -77,7 +78,7 @@ class DevicePublisher:
     """Publisher of one device. Thread-safe.
 
     Only the command processor calls ``publish_description``, ``publish_state``, ``repeat_acks`` and
-    ``record_delivered``.
+    ``update_journal``.
 
     Attributes:
         rejections: Number of rejections by code.
@@ -113,6 +114,7 @@ class DevicePublisher:
         self._journal = journal
         self._publish = publish
         self._outbox = outbox
+        self._unrecorded: deque[Ack] = deque()
         self._delivered: queue.SimpleQueue[Ack] = queue.SimpleQueue()
         self._ack_sent = threading.Event()
         self._repeat_s = float("inf")
@@ -139,13 +141,24 @@ class DevicePublisher:
         return Ack(id=command, status=status, sequence=sequence, at_ms=wall_ms(), tick_ms=tick_ms(), **fields)  # type: ignore[arg-type]
 
     def report(self, command: str, status: AckStatus, **fields: object) -> None:
-        """Journal and publish the next ack of a command."""
+        """Journal and publish the next ack of a command.
+
+        A terminal ack is also published if it cannot be journalled: ``update_journal`` journals it later.
+
+        Raises:
+            JournalError: Another ack cannot be journalled; it is not published.
+        """
         ack = self.create_ack(command, status, **fields)
-        self._journal.record(ack)
+        try:
+            self._journal.record(ack)
+        except JournalError:
+            if not ack.status.terminal:
+                raise
+            self._unrecorded.append(ack)
         self.send_ack(ack)
 
     def send_ack(self, ack: Ack) -> None:
-        """Publish a journalled ack; ``repeat_acks`` repeats it until it is delivered."""
+        """Publish an ack; ``repeat_acks`` repeats journalled acks until they are delivered."""
         self._transmit(ack)
         self._ack_sent.set()
 
@@ -172,8 +185,15 @@ class DevicePublisher:
         else:
             self._repeat_s = float("inf")
 
-    def record_delivered(self) -> None:
-        """Journal which acks were delivered."""
+    def update_journal(self) -> None:
+        """Journal terminal acks that could not be journalled before, and which acks were delivered.
+
+        Raises:
+            JournalError: The next call continues.
+        """
+        while self._unrecorded:
+            self._journal.record(self._unrecorded[0])
+            self._unrecorded.popleft()
         while not self._delivered.empty():
             self._journal.delivered(self._delivered.get())
 

@@ -5,11 +5,12 @@ from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 import pytest
 
 from device_agent.protocol import Ack, AckStatus, codec
-from device_agent.runtime.storage.journal import Journal
+from device_agent.runtime.storage.journal import Journal, JournalError
 from device_agent.runtime.telemetry import device_publisher as module
 from device_agent.runtime.telemetry.device_publisher import DevicePublisher
 from tests.fakes.drivers import robot_type
@@ -54,7 +55,7 @@ class PublisherFixture:
     def run(self, seconds: float) -> None:
         for _ in range(round(4 * seconds)):
             self.now_s += 0.25
-            self.publisher.record_delivered()
+            self.publisher.update_journal()
             self.publisher.repeat_acks()
 
     def times(self, name: str) -> list[float]:
@@ -120,3 +121,23 @@ def test_nothing_is_repeated_after_a_full_last_part(fixture: PublisherFixture) -
     fixture.run(20)
     assert len(fixture.sent) == sent
     assert fixture.publisher._repeat_s == float("inf")
+
+
+def test_a_terminal_ack_is_sent_on_a_full_disk_and_journalled_later(
+    fixture: PublisherFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fixture.journal.begin("arm", fixture.publisher.create_ack("c1", AckStatus.RECEIVED))
+    record = fixture.journal.record
+    monkeypatch.setattr(fixture.journal, "record", Mock(side_effect=JournalError("is the disk full?")))
+    with pytest.raises(JournalError):
+        fixture.publisher.report("c1", AckStatus.STARTED)
+    assert fixture.sent == []
+    fixture.publisher.report("c1", AckStatus.DONE)
+    assert [command for _, command in fixture.sent] == ["c1"]
+    with pytest.raises(JournalError):
+        fixture.publisher.update_journal()
+    monkeypatch.setattr(fixture.journal, "record", record)
+    fixture.publisher.update_journal()
+    last = fixture.journal.begin("arm", fixture.publisher.create_ack("c1", AckStatus.RECEIVED))
+    assert last is not None
+    assert last.status is AckStatus.DONE
