@@ -176,8 +176,8 @@ class World:
     async def _probe(self, device: str) -> None:
         """The first commands of the owner must succeed: reset Stop if it is latched, take control, move."""
         owner, machine = self.owner_of(device), self.machine_of(device)
-        if machine.pairing is None:
-            return
+        if machine.pairing is None or (self.faults.restored and not await self._may_operate(owner, device)):
+            return  # unpaired, or paired after the backup
         if self.monitors.robots.models[device].latched:
             operation = self.history.invoke(owner.name, "probe-reset", device)
             confirmed = await owner.request(
@@ -201,6 +201,13 @@ class World:
         if started is None or started[0].status is not Status.DONE:
             code = operation.outcome if started is None else (started[0].reason or {}).get("code", "")
             self.history.violate(f"blocked ({code})", f"{device}: the first action after all faults did not succeed")
+
+    async def _may_operate(self, owner: Person, device: str) -> bool:
+        def find(functions: "Functions") -> Awaitable[Any]:
+            return functions.devices.find_with_link(owner.identity, device)
+
+        found, _ = await self.call(owner.name, find)
+        return found is not None
 
     # ------------------------------------------------------------ processes of the cloud
 

@@ -57,6 +57,12 @@ JOURNAL_MS = 7 * 24 * 3_600_000
 Without this limit, an agent that has deleted the outcome would report an executed command as expired.
 """
 
+UNSHARED = "unshared"
+KEY_ENDED = "api-key-ended"
+SIGNED_OUT = "signed-out"
+WITHDRAWN = frozenset({UNSHARED, KEY_ENDED, SIGNED_OUT})
+"""Codes of ``withdraw``."""
+LOST = "lost"
 NO_REPORT = (
     "The device has not reported how the action ended; it may have executed it. Check the device. The result appears "
     "here when the device reports it."
@@ -148,11 +154,13 @@ class AckReport:
 
 def apply_report(action: Action, report: AckReport) -> Action:
     """The action after an ack. Duplicate, late and reordered acks never revert a step."""
-    if action.status.terminal or action.status is Status.QUEUED:
+    if action.status is Status.QUEUED or (action.status.terminal and not is_lost(action)):
         return action  # a queued action was never sent, so this ack is not genuine
     if report.status is Status.EXPIRED and action.cancel_id:
         reason = {"code": "cancelled", "message": "Cancelled before the device received it."}
         report = replace(report, status=Status.CANCELLED, reason=reason)
+    if report.status.terminal and report.status is not Status.DONE and is_withdrawn(action):
+        report = replace(report, status=Status.FAILED, reason=action.reason)
     if 0 < report.device_epoch < action.epoch:
         return action  # the rejected command was issued again with a higher epoch
     times = action.times if report.status.value in action.times else {**action.times, report.status.value: report.at_ms}
@@ -164,7 +172,7 @@ def apply_report(action: Action, report: AckReport) -> Action:
         same = times is action.times and received is action.received
         return action if same else replace(action, times=times, received=received)
     newest = report.sequence > action.sequence or report.status.terminal
-    doubt = action.status is Status.UNKNOWN and report.status.terminal
+    doubt = report.status.terminal and (action.status is Status.UNKNOWN or is_lost(action))
     return replace(
         action,
         times=times,
@@ -212,6 +220,24 @@ def end(action: Action, status: Status, code: str, message: str, now_ms: int) ->
     return replace(
         action, status=status, times={**action.times, status.value: now_ms}, reason={"code": code, "message": message}
     )
+
+
+def withdraw(action: Action, code: str, message: str, now_ms: int) -> Action:
+    """The action after its account lost the right to run it. It is cancelled at the device, which may have executed it.
+
+    Its outcome is unknown until the device reports: ``done``, or ``failed`` with this reason.
+    """
+    return action if action.status is Status.UNKNOWN else end(action, Status.UNKNOWN, code, message, now_ms)
+
+
+def is_withdrawn(action: Action) -> bool:
+    """Whether its account lost the right to run it, and the device has not reported its end."""
+    return action.status is Status.UNKNOWN and action.reason is not None and action.reason["code"] in WITHDRAWN
+
+
+def is_lost(action: Action) -> bool:
+    """Whether the cloud ended it without a report. A report that arrives nevertheless replaces this end."""
+    return action.status.terminal and action.reason is not None and action.reason["code"] == LOST
 
 
 def reached(action: Action, status: Status) -> bool:
@@ -263,6 +289,8 @@ def next_step(action: Action, now_ms: int) -> NextStep:
     if action.status is Status.QUEUED:
         return NextStep.EXPIRE if now_ms >= action.queued_until_ms else NextStep.WAIT
     if action.status is Status.UNKNOWN:
+        if now_ms < action.expires_ms:
+            return NextStep.CANCEL  # the device would start it
         return NextStep.LOSE if now_ms >= action.issued_ms + JOURNAL_MS else NextStep.ASK
     return _step_in_slot(action, now_ms)
 

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from function_app.domain.actions.action import Status
+from function_app.domain.actions.action import KEY_ENDED, SIGNED_OUT, UNSHARED, Status
 from function_app.domain.common.problems import Problem
 
 MAX_QUEUED: Final = 32
@@ -18,9 +18,6 @@ STOPPED = "stopped"
 UNPAIRED = "unpaired"
 MOVED = "moved"
 REMOVED = "removed"
-UNSHARED = "unshared"
-KEY_ENDED = "api-key-ended"
-SIGNED_OUT = "signed-out"
 RESTORED = "restored"
 DROPPED: Final = {
     FAILED_BEFORE: (

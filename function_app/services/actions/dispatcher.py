@@ -3,8 +3,8 @@
 import msgspec
 
 from device_agent.protocol import RunMovement, Task
-from function_app.domain.actions.action import ASK_MS, Action, mark_published
-from function_app.domain.actions.queue import DROPPED, KEY_ENDED, SIGNED_OUT, UNPAIRED, UNSHARED
+from function_app.domain.actions.action import ASK_MS, KEY_ENDED, SIGNED_OUT, UNSHARED, Action, mark_published
+from function_app.domain.actions.queue import DROPPED, UNPAIRED
 from function_app.domain.common.ids import split_command, split_device
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent, Device, Link

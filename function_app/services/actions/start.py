@@ -9,8 +9,8 @@ from typing import Any
 import msgspec
 
 from device_agent.protocol import Ack, CollectData, RunMovement, Task
-from function_app.domain.actions.action import RETRY_MS, Action, Status, end, reached
-from function_app.domain.actions.queue import DROPPED, KEY_ENDED, UNSHARED
+from function_app.domain.actions.action import KEY_ENDED, RETRY_MS, UNSHARED, Action, Status, end, reached
+from function_app.domain.actions.queue import DROPPED
 from function_app.domain.common.ids import command_id
 from function_app.domain.common.problems import Problem, busy_store, invalid
 from function_app.domain.control import lease as rules

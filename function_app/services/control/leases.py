@@ -6,7 +6,7 @@ from typing import NamedTuple
 from device_agent.protocol import GrantLease, ReleaseLease, topics
 from device_agent.protocol.fields import printable
 from device_agent.protocol.security import setpoints, signing
-from function_app.domain.actions.queue import UNSHARED
+from function_app.domain.actions.action import UNSHARED
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import lease as rules
 from function_app.domain.control.lease import Lease

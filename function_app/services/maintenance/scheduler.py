@@ -6,7 +6,18 @@ Run it every second in one or more processes; every job is idempotent and safe t
 import logging
 
 from device_agent.protocol import CancelAction
-from function_app.domain.actions.action import NO_REPORT, Action, NextStep, Status, end, next_check_ms, next_step
+from function_app.domain.actions.action import (
+    LOST,
+    NO_REPORT,
+    Action,
+    NextStep,
+    Status,
+    end,
+    is_withdrawn,
+    next_check_ms,
+    next_step,
+    withdraw,
+)
 from function_app.domain.common.ids import CLAIM_ALPHABET
 from function_app.domain.common.problems import Problem
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
@@ -42,7 +53,7 @@ KEEP_ONCE_MS = DAY_MS
 """Validity of an idempotency key: one day."""
 TIME_LIMIT = "the time limit"
 """Caller of the cancellation at a deadline, as the action's reason names it."""
-LOST = "The device did not report within a week how the action ended. Check the device."
+NEVER_REPORTED = "The device did not report within a week how the action ended. Check the device."
 _ENDING = frozenset({NextStep.ENDED, NextStep.LOSE, NextStep.DOUBT, NextStep.EXPIRE})
 _HEX = "0123456789abcdef"
 
@@ -178,7 +189,7 @@ class Scheduler:
         if verdict is NextStep.ENDED:
             return result.action
         if verdict is NextStep.LOSE:
-            return await self._end(result, Status.FAILED, "lost", LOST, now_ms)
+            return await self._end(result, Status.FAILED, LOST, NEVER_REPORTED, now_ms)
         if verdict is NextStep.DOUBT:
             return await self._end(result, Status.UNKNOWN, "no-report", NO_REPORT, now_ms)
         return await self._end(result, Status.EXPIRED, "queue-timeout", TIMEOUT, now_ms)
@@ -229,17 +240,19 @@ class Scheduler:
             return
         try:
             await self._dispatcher.send(result, device)
-        except (MovementUnavailable, PermissionEnded) as error:
-            # A request records its publication at its end, so the device may have the command already. It is asked
-            # once the command has expired.
-            _log.info("action %s is not sent again: %s", result.action.id, error)
+        except PermissionEnded as error:
+            # A request records its publication at its end, so the device may have the command already.
+            why, message = error.why, str(error)
+            await self._queues.change(result.action.id, lambda action: withdraw(action, why, message, now_ms))
+        except MovementUnavailable:
+            _log.info("action %s is not sent again: its script was deleted", result.action.id)
 
     async def _ask(self, result: StoredAction, now_ms: int) -> None:
         """Ask the device for the outcome."""
         device = await self._dispatcher.device(result.action)
         if device is None:
             message = "The device was unpaired before it reported how the action ended."
-            await self._end(result, Status.FAILED, "lost", message, now_ms)
+            await self._end(result, Status.FAILED, LOST, message, now_ms)
             return
         try:
             await self._dispatcher.ask(result.action, device)
@@ -249,7 +262,8 @@ class Scheduler:
     async def _cancel(self, action: Action) -> None:
         device = await self._dispatcher.device(action)
         if device is not None:
-            order, caller = CancelAction(action=action.id), action.caller if action.cancel_id else TIME_LIMIT
+            caller = "telescope" if is_withdrawn(action) else TIME_LIMIT
+            order, caller = CancelAction(action=action.id), action.caller if action.cancel_id else caller
             await self._command_sender.try_send(device, order, caller=caller, epoch=action.epoch)
 
     async def _delete_expired(self) -> None:

@@ -14,8 +14,8 @@ import logging
 from typing import Final
 
 from device_agent.protocol import CancelAction
-from function_app.domain.actions.action import end
-from function_app.domain.actions.queue import DROPPED, UNSHARED
+from function_app.domain.actions.action import UNSHARED, withdraw
+from function_app.domain.actions.queue import DROPPED
 from function_app.domain.devices.access import Share, split_target
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
@@ -119,9 +119,9 @@ class AccessRevocation:
         if result is None or result.action.account != account or result.action.pairing != device.pairing:
             return True
         # Stored before it is sent. If it is lost, the repeated release of the lease also stops the action.
-        status, message = DROPPED[UNSHARED]
+        _, message = DROPPED[UNSHARED]
         now_ms = self._clock.now_ms()
-        await self._queues.change(result.action.id, lambda existing: end(existing, status, UNSHARED, message, now_ms))
+        await self._queues.change(result.action.id, lambda existing: withdraw(existing, UNSHARED, message, now_ms))
         epoch = max(control.lease.epoch if control.lease else 0, result.action.epoch)
         try:
             async with asyncio.timeout_at(until_s):

@@ -23,6 +23,7 @@ from function_app.domain.actions.action import (
     next_check_ms,
     next_step,
     reached,
+    withdraw,
 )
 
 NEW = Action(
@@ -193,6 +194,33 @@ def test_a_report_ends_an_unknown_outcome(before: tuple[Status, ...], last: Stat
     assert (ended.status, ended.reason) == (last, None)
     assert ended.times == doubtful.times | {last.value: 3_000_000}
     assert end(ended, Status.FAILED, "lost", "x", 4_000_000) is ended
+
+
+@pytest.mark.parametrize("last", ENDS)
+def test_a_report_replaces_a_lost_outcome(last: Status) -> None:
+    """The cloud's clock may have been wrong when it gave up."""
+    lost = end(unknown(), Status.FAILED, "lost", "Not reported.", 4_000_000)
+    ended = apply_report(lost, AckReport(last, 9, 3_000_000))
+    assert (ended.status, ended.reason) == (last, None)
+    assert apply_report(lost, AckReport(Status.STARTED, 3, 3_000_000)).status is Status.FAILED
+
+
+@pytest.mark.parametrize("last", ENDS)
+def test_an_action_without_permission_fails_unless_the_device_has_completed_it(last: Status) -> None:
+    withdrawn = withdraw(applied(NEW, life(*LIFE[:2])), "unshared", "Not shared.", 1_000_500)
+    reason = {"code": "unshared", "message": "Not shared."}
+    assert (withdrawn.status, withdrawn.reason) == (Status.UNKNOWN, reason)
+    ended = apply_report(withdrawn, AckReport(last, 9, 1_000_600, reason={"code": "cancelled", "message": "x"}))
+    expected = (Status.DONE, ended.reason) if last is Status.DONE else (Status.FAILED, reason)
+    assert (ended.status, ended.reason) == expected
+    assert withdraw(ended, "unshared", "Not shared.", 1_000_700) is ended
+
+
+def test_an_action_without_permission_is_cancelled_until_the_device_may_be_asked() -> None:
+    withdrawn = withdraw(NEW, "unshared", "Not shared.", 1_000_500)
+    assert next_step(withdrawn, NEW.expires_ms - 1) is NextStep.CANCEL, "the device would start it"
+    assert next_step(withdrawn, NEW.expires_ms) is NextStep.ASK
+    assert withdraw(withdrawn, "api-key-ended", "x", 1_000_600) is withdrawn
 
 
 def test_progress_does_not_end_an_unknown_outcome() -> None:

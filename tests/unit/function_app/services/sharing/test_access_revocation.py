@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import AckStatus, GrantLease, MoveJoints, ReleaseLease
+from device_agent.protocol import AckStatus, CancelAction, GrantLease, MoveJoints, ReleaseLease
 from function_app.domain.actions.action import Status
 from function_app.domain.devices.access import Share
 from function_app.domain.identity.accounts import Role
@@ -82,13 +82,15 @@ class TestQueuedActions:
         for _ in range(4):
             cloud.clock.advance(1.1)
             cloud.sweep()
-        assert anna.action(action)["status"] == "published", "the device may have executed it"
+        assert anna.action(action)["status"] == "unknown", "the device may have executed it"
         assert len(robot.payloads[action]) == 1
+        assert robot.received(CancelAction), "an unexpired command would be started, so it is cancelled"
         robot.forget(action)
         robot.silent = False
-        cloud.clock.advance(2)
+        cloud.clock.advance(4)
         cloud.sweep()
-        assert anna.action(action)["status"] == "expired"
+        ended = anna.action(action)
+        assert (ended["status"], ended["reason"]["code"]) == ("failed", "api-key-ended")
 
     def test_an_unpublished_command_of_a_revoked_key_never_starts(
         self, cloud: Cloud, anna: Person, robot: Robot, broker: MemoryBroker
@@ -104,7 +106,8 @@ class TestQueuedActions:
         assert action not in robot.payloads
         cloud.clock.advance(10)
         cloud.sweep()
-        assert anna.action(action)["status"] == "expired", "the device says that it has not started it"
+        ended = anna.action(action)
+        assert (ended["status"], ended["reason"]["code"]) == ("failed", "api-key-ended")
 
     def test_a_command_of_a_revoked_key_that_the_device_has_executed_is_done(
         self, cloud: Cloud, anna: Person, robot: Robot
@@ -120,7 +123,8 @@ class TestQueuedActions:
         cloud.clock.advance(2)
         cloud.sweep()
         robot.report(action, AckStatus.DONE)
-        assert anna.action(action)["status"] == "done"
+        ended = anna.action(action)
+        assert (ended["status"], ended["reason"]) == ("done", None)
 
 
 class TestGrants:

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from device_agent.protocol import CancelAction, MoveJoints, ReleaseLease, topics
+from device_agent.protocol import AckStatus, CancelAction, MoveJoints, ReleaseLease, topics
 from function_app.domain.identity.accounts import Identity, Role
 from tests.fakes.agent import Robot
 from tests.fakes.broker import MemoryBroker
@@ -80,6 +80,9 @@ def busy(anna: Person, bert: Person, robot: Robot) -> Busy:
 
 def expect_the_end(busy: Busy, status: int = 404, code: str = "device-unknown", event: str = "unshared") -> None:
     anna, bert, robot, epoch, running, waiting = busy
+    unreported = anna.action(running)
+    assert (unreported["status"], unreported["reason"]["code"]) == ("unknown", "unshared")
+    robot.report(running, AckStatus.CANCELLED)
     for action in (running, waiting):
         ended = anna.action(action)
         assert (ended["status"], ended["reason"]["code"]) == ("failed", "unshared")
