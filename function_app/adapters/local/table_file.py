@@ -84,6 +84,20 @@ def log_of(path: Path) -> Path:
     return path.with_name(f"{path.name}-wal")
 
 
+def require_content(path: Path) -> None:
+    """SQLite deletes the log of an empty file when it opens the file.
+
+    Raises:
+        StoreError: The file is missing or empty, but its log exists.
+    """
+    log = log_of(path)
+    if log.exists() and log.stat().st_size and not (path.exists() and path.stat().st_size):
+        raise StoreError(
+            f"the tables in {path} are missing or empty, but their log exists. Restore a backup, or move {log.name} "
+            "away to start with empty tables."
+        )
+
+
 def has_lost_commits(path: Path) -> bool:
     """Whether the log contains commits behind a damaged frame, which SQLite ignores. Exact only with the write lock.
 
@@ -154,6 +168,9 @@ def damage(path: Path) -> Iterator[str]:
     except (sqlite3.Error, UnicodeDecodeError) as error:  # SQLite's message may quote damaged text
         yield f"the tables in {path.name} cannot be read completely: {error}. Restore a backup."
         return
+    except StoreError as error:
+        yield str(error)
+        return
     for place in places[:_MAX_SHOWN]:
         yield str(DamagedRowError(place))
     if len(places) > _MAX_SHOWN:
@@ -201,7 +218,8 @@ def _damaged_rows(database: sqlite3.Connection) -> Iterator[RowKey]:
 
 
 def _opened(path: Path) -> sqlite3.Connection:
-    """A connection that reads damaged text, too."""
+    """A connection that reads damaged text, too. Raises ``StoreError`` as ``require_content`` does."""
+    require_content(path)
     database = sqlite3.connect(path, isolation_level=None)
     database.text_factory = lambda text: text.decode(errors=_BYTES)
     return database

@@ -233,12 +233,8 @@ class SqliteTables:
     def _open(self) -> sqlite3.Connection:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
+            table_file.require_content(self._path)
             if not self._path.exists():
-                if table_file.log_of(self._path).exists():
-                    raise StoreError(
-                        f"the tables in {self._path} are missing, but their log exists. Restore a backup, or move "
-                        f"{table_file.log_of(self._path).name} away to start with empty tables."
-                    )
                 os.close(os.open(self._path, os.O_CREAT | os.O_WRONLY, 0o600))
             db = sqlite3.connect(
                 self._path,

@@ -26,6 +26,7 @@ _CONTENT = b"health check"
 _MAX_WAITING = 100
 _MAX_SHOWN = 5
 _NO_WORKER = "No worker runs: messages of devices are not stored. Start `telescope-server work`."
+_UNREAD = Finding(Status.FAILED, "Not known, because the heartbeats of the workers cannot be read.")
 
 _log = logging.getLogger(__name__)
 
@@ -118,10 +119,11 @@ class ReadinessCheck:
             return self._health
 
     async def _measure(self) -> Health:
-        workers: list[Heartbeat] = []
+        workers: list[Heartbeat] | None = None
 
         async def read_workers() -> Finding:
-            workers.extend(await self._heartbeats.all())
+            nonlocal workers
+            workers = await self._heartbeats.all()
             return self._workers(workers)
 
         checks: list[tuple[str, Callable[[], Awaitable[Finding]]]] = [
@@ -134,9 +136,9 @@ class ReadinessCheck:
         results = await asyncio.gather(*(_guarded(name, check) for name, check in checks))
         findings = {name: result for (name, _), result in zip(checks, results, strict=True)}
         findings["disk"] = await _guarded("disk", self._check_disk)
-        findings["timers"] = self._timers(workers)
+        findings["timers"] = _UNREAD if workers is None else self._timers(workers)
         if self._subscribes:
-            findings["ingest"] = self._ingest(workers)
+            findings["ingest"] = _UNREAD if workers is None else self._ingest(workers)
         earlier = {part.name: part for part in self._health.parts}
         now_ms = self._clock.now_ms()
         parts = []
@@ -146,7 +148,7 @@ class ReadinessCheck:
             parts.append(Part(name, finding.status, finding.message, since_ms))
             if last is not None and last.status is not finding.status:
                 _log.warning("health of %s: %s: %s", name, finding.status, finding.message)
-        return Health(tuple(parts), tuple(workers), self._lag_ms())
+        return Health(tuple(parts), tuple(workers or ()), self._lag_ms())
 
     async def _check_tables(self) -> Finding:
         """A row can be written and read, and no data are known to be lost or damaged."""

@@ -177,9 +177,17 @@ async def test_a_missing_table_or_file_is_not_replaced_by_an_empty_one(tmp_path:
     source = tmp_path / "other.sqlite"
     await filled(source, 1)
     copy = copied(source, tmp_path / "copy")
-    copy.unlink()
-    with pytest.raises(StoreError, match="are missing, but their log exists"):
-        await SqliteTables(copy).get("T", "p", "k")
+    log = table_file.log_of(copy).read_bytes()
+    for content in (None, b""):
+        copy.unlink()
+        if content is not None:
+            copy.write_bytes(content)
+        (problem,) = table_file.damage(copy)
+        assert "are missing or empty, but their log exists" in problem
+        with pytest.raises(StoreError, match="are missing or empty, but their log exists"):
+            await SqliteTables(copy).get("T", "p", "k")
+        assert table_file.log_of(copy).read_bytes() == log
+        copy.touch()
 
 
 @pytest.mark.parametrize("how", ["deleted", "replaced", "log deleted"])

@@ -72,7 +72,11 @@ class Site:
         return size - before
 
     def await_ok(self) -> float:
-        return _duration_s(lambda: not self.not_ok(), f"ok, not {self.parts()}")
+        try:
+            return _duration_s(lambda: not self.not_ok(), "health that is ok")
+        except AssertionError as error:
+            left = [part for part in self.parts().values() if part["status"] != "ok"]
+            raise AssertionError(f"{error}: {left}; worker: {self.worker.stderr()[-2000:]}") from None
 
     def await_shown(self, part: str) -> float:
         return _duration_s(lambda: part in self.not_ok(), f"failed {part}")

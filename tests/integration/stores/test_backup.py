@@ -340,6 +340,12 @@ def test_commands_refuse_what_they_cannot_do(
     monkeypatch.setenv("TELESCOPE_HOME", str(tmp_path / "empty"))
     assert "contains no tables" in run("backup", tmp_path / "new.zip")[1]
     assert "contains no tables" in run("verify")[1]
+    (tmp_path / "empty").mkdir(exist_ok=True)
+    (tmp_path / "empty" / "tables.sqlite").touch()
+    (tmp_path / "empty" / "tables.sqlite-wal").write_bytes(b"the log of the tables")
+    assert "their log exists" in run("backup", tmp_path / "new.zip")[1]
+    assert "keys/ring.json" in run("verify")[1]
+    assert (tmp_path / "empty" / "tables.sqlite-wal").exists()
     monkeypatch.setenv("TELESCOPE_STORE", "azure")
     monkeypatch.setenv("TELESCOPE_STORAGE_CONNECTION", "UseDevelopmentStorage=true")
     assert "point-in-time" in run("backup", tmp_path / "new.zip")[1]

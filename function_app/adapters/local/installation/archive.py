@@ -18,7 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from function_app.adapters.local.table_file import FILE_NAME
+from function_app.adapters.local.table_file import FILE_NAME, require_content
+from function_app.ports.tables import StoreError
 
 MANIFEST: Final = "manifest.json"
 TABLES: Final = FILE_NAME
@@ -63,6 +64,10 @@ def write(home: Path, archive: Path, *, tables_format: int, progress: Progress) 
         raise ArchiveError(f"{archive} exists; choose another name")
     if not (home / TABLES).is_file():
         raise ArchiveError(f"{home} contains no tables; set TELESCOPE_HOME to the folder of the installation")
+    try:
+        require_content(home / TABLES)
+    except StoreError as error:
+        raise ArchiveError(str(error)) from error
     part = archive.with_name(f"{archive.name}.part")
     manifest = Manifest(time.time_ns() // 1_000_000, tables_format)
     try:

@@ -84,6 +84,17 @@ def test_a_broker_that_cannot_be_reached_is_failed(cloud: Cloud) -> None:
     assert parts(cloud)["broker"]["status"] == "ok"
 
 
+def test_without_readable_tables_nothing_is_said_about_workers(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def fail(*_: object) -> None:
+        raise StoreError("the disk is broken.")
+
+    monkeypatch.setattr(cloud.functions.heartbeats, "all", fail)
+    found = parts(cloud)
+    assert found["workers"]["message"] == "the disk is broken."
+    for name in ("timers", "ingest"):
+        assert (found[name]["status"], "cannot be read" in found[name]["message"]) == ("failed", True)
+
+
 @pytest.mark.parametrize(("store", "call"), [("tables", "check"), ("tables", "create"), ("blobs", "put")])
 def test_a_store_that_cannot_be_written_is_failed(
     cloud: Cloud, monkeypatch: pytest.MonkeyPatch, store: str, call: str
