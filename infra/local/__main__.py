@@ -1,5 +1,6 @@
 """``python -m infra.local``: start the product, print one line that starts with ``ready``, run until Ctrl-C."""
 
+import argparse
 import importlib.util
 import json
 import os
@@ -298,5 +299,10 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(
+        prog="python -m infra.local",
+        description="Run Telescope on this machine until Ctrl-C, as `make up` does.",
+        epilog="Settings are environment variables; see docs/reference/configuration.md.",
+    ).parse_args()
     os.chdir(Path(__file__).resolve().parents[2])
     sys.exit(main())
