@@ -12,6 +12,13 @@ class DriverError(Exception):
     """The hardware or simulation cannot execute the request. The message is shown to operators."""
 
 
+class UnreachableError(DriverError):
+    """The device cannot be used now, but may be later: it is off, not connected, or sends no valid measurements.
+
+    The agent starts without the device, reports a fault, and connects again every second.
+    """
+
+
 class Twist(NamedTuple):
     """Velocity of a base in its own frame."""
 
@@ -33,12 +40,15 @@ class Observation:
         velocity_rad_s: Measured velocities, shape (n,) [rad/s].
         effort_nm: Joint torques, shape (n,) [N m].
         frames: Pose of each of the type's ``frames`` in the robot's base frame.
+        at_s: When the device sent new values last, on the agent's monotonic clock [s]; ``None``: just now. A message
+            that repeats the device's previous timestamp is not new.
     """
 
     position_rad: tuple[float, ...]
     velocity_rad_s: tuple[float, ...]
     effort_nm: tuple[float, ...]
     frames: tuple[Pose, ...]
+    at_s: float | None = None
 
 
 class Driver(Protocol):
@@ -46,10 +56,15 @@ class Driver(Protocol):
 
     One thread, the control loop, calls ``observe`` and ``send`` once per ``period_ms`` (see also ``RunsInline``).
     Neither blocks for longer than a fraction of the period. The constructor accesses neither disk, network nor
-    hardware.
+    hardware. Threads of a driver are ``SupervisedThread``; ``close`` ends them.
+
+    A device may be lost and return at any time. Then ``observe``, ``send`` and ``drive`` raise ``UnreachableError``.
+    The control loop calls ``connect`` every second until it succeeds, and takes the measured positions as the present
+    ones. A driver never connects again on its own, and never repeats a command after a reconnection.
 
     The device must not depend on the agent to come to rest: without new commands it holds its joints, and a base that
-    would continue to move brakes (see ``MobileDriver``).
+    would continue to move brakes (see ``MobileDriver``). A driver that commands velocities of joints needs a watchdog
+    for them too: ``device_agent.drivers.watchdog``.
     """
 
     @property
@@ -59,28 +74,34 @@ class Driver(Protocol):
     def connect(self) -> None:
         """Open the hardware or build the simulation; afterwards the device holds its position.
 
+        It also replaces a lost connection, within 10 s. It returns after a complete measurement that is known to be
+        new: if the device sends timestamps, after the second one.
+
         Raises:
-            DriverError: The device is missing or does not respond; the message names what to check.
+            UnreachableError: The device is missing or does not respond; the message names what to check.
+            DriverError: The device can never be used as configured; at its start the agent ends with this message.
         """
 
     def twin(self) -> Twin | None:
-        """Model for live views, or ``None``. Called once, after ``connect``."""
+        """Model for live views, or ``None``. Called once, after ``connect``, also if the device is unreachable."""
 
     def observe(self) -> Observation:
-        """The newest measurement.
+        """The newest measurement: finite values of all joints, matched by name and converted to SI units.
 
         Raises:
-            DriverError: The device does not respond. The agent then holds and raises a fault.
+            UnreachableError: The device has sent no valid new values for some time, at most 1 s. The agent then holds
+                and raises a fault.
         """
 
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
         """Command joint positions for the next period, shape (n,) [rad], limited by the agent.
 
         Returns:
-            The positions that were applied, after limits of the driver, shape (n,) [rad].
+            The positions that were applied, after limits of the driver and the device, shape (n,) [rad].
 
         Raises:
-            DriverError: As for ``observe``.
+            DriverError: As for ``observe``; or wrong number of values, a value is not finite, or the device has stopped
+                itself. Nothing is sent to the device then.
         """
 
     def halt(self) -> None:
@@ -109,6 +130,34 @@ class RunsInline(Driver, Protocol):
     @property
     def prompt(self) -> bool:
         """Whether this applies to the instance."""
+
+
+@dataclass(frozen=True, slots=True)
+class DriverFault:
+    """A fault that the device reports itself, for example a safety mode.
+
+    Attributes:
+        code: Kind of the fault: ``protective-stop``. Operators see it as ``driver.protective-stop``.
+        message: What has happened, and what to do.
+        stops: Whether the device has stopped itself, or must not move. The agent then sends no commands, latches Stop,
+            and holds at the measured position. After the fault an operator resets Stop. Other faults are only shown.
+    """
+
+    code: str
+    message: str
+    stops: bool = True
+
+
+@runtime_checkable
+class ReportsFaults(Driver, Protocol):
+    """A driver of a device with safety modes, protective stops or other faults of its own."""
+
+    def faults(self) -> Sequence[DriverFault]:
+        """The present faults; empty if there are none or they are unknown.
+
+        The control loop calls it after each ``observe``. It only accesses memory. An unknown safety mode is a fault
+        that ``stops``.
+        """
 
 
 @runtime_checkable

@@ -179,7 +179,7 @@ class Device:
             keys=keys,
             wake=self._wake,
             part_faults=self._part_faults.present,
-            device_faults=tuple if room_device is None else room_device.watchdog.faults,
+            device_faults=self._loop.faults,
             load=self._load,
         )
 

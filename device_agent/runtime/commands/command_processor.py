@@ -331,14 +331,10 @@ class CommandProcessor:
                 raise
 
     def _faults(self) -> tuple[Fault, ...]:
-        """Open faults: of threads; the driver's error, or else those that the driver does not raise."""
-        error, parts = self._controller.fault, self._part_faults()
-        if error is None:
-            present = parts + self._device_faults()
-        elif any(error == fault.message for fault in parts):
-            present = parts
-        else:
-            present = (*parts, Fault(code=_DRIVER, message=error[:2000], since_ms=wall_ms()))
+        """Open faults: of threads, those that the device reports, and the driver's error unless it is one of them."""
+        error, present = self._controller.fault, self._part_faults() + self._device_faults()
+        if error is not None and not any(error == fault.message for fault in present):
+            present += (Fault(code=_DRIVER, message=error[:2000], since_ms=wall_ms()),)
         changes = self._fault_reporter.update(present)
         self._fault_raised = bool(changes.raised)
         for fault in changes.raised:

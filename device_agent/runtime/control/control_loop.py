@@ -14,10 +14,20 @@ from typing import Any
 import numpy as np
 
 from device_agent.ports.clock import tick_ms, wall_ms
-from device_agent.ports.driver import Driver, DriverError, MobileDriver, Observation, RunsInline
+from device_agent.ports.driver import (
+    Driver,
+    DriverError,
+    DriverFault,
+    MobileDriver,
+    Observation,
+    ReportsFaults,
+    RunsInline,
+    UnreachableError,
+)
 from device_agent.ports.threads import Recovery, SupervisedThread
-from device_agent.protocol import JointTelemetry, Mode
+from device_agent.protocol import Fault, JointTelemetry, Mode, StopLatch
 from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.runtime.control import measurement
 from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import INTERNAL_ERROR
@@ -66,6 +76,10 @@ class ControlLoop:
         self._driver = driver
         self._base = driver if robot_type.base is not None and isinstance(driver, MobileDriver) else None
         self._lacks_base = robot_type.base is not None and self._base is None
+        self._reports_faults = driver if isinstance(driver, ReportsFaults) else None
+        self._device_faults: tuple[DriverFault, ...] = ()
+        self._device_stopped = False
+        self._joints = len(robot_type.joints)
         self._controller = controller
         self._name = name
         self._publish = publish
@@ -94,17 +108,28 @@ class ControlLoop:
         self.observation: Observation | None = None
 
     def start(self) -> None:
-        """Connect the driver and hold the present position.
+        """Connect the driver and hold the present position. An unreachable device has a fault until it responds.
 
         Raises:
-            DriverError: The device does not respond, or its driver cannot drive the base of the robot type.
+            DriverError: The device can never be used, or its driver cannot drive the base of the robot type.
         """
         if self._lacks_base:
             raise DriverError(f"the robot type of '{self._name}' has a base, but its driver cannot drive")
-        self._driver.connect()
-        self.observation = self._driver.observe()
-        self._controller.start_at(self.observation.position_rad)
+        try:
+            self._driver.connect()
+            self.observation = self._observe()
+            self._controller.start_at(self.observation.position_rad)
+        except UnreachableError as error:
+            self._error = str(error)
+            self._controller.set_fault(self._error)
         self._thread.start()
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Faults that the device reports itself. Thread-safe."""
+        return tuple(
+            Fault(code=f"driver.{fault.code}", message=fault.message[:2000], since_ms=wall_ms())
+            for fault in self._device_faults
+        )
 
     def fail(self, message: str) -> None:
         """Stop the device without the loop, which has ended or hangs. If it responds again, it reconnects."""
@@ -187,15 +212,13 @@ class ControlLoop:
         self._requested.clear()  # this period includes all requests so far
         try:
             # A device at rest is where the previous period observed it.
-            observation = (early and self.observation) or self._driver.observe()
+            observation = (early and self.observation) or self._observe()
             self.observation = observation
             self._check_interlocks(now_s)
+            self._update_device_stop(observation)
             elapsed_s = self._elapsed_s(now_s) if early and self._controller.moving else None
             output = self._controller.update(now_s, observation.position_rad, elapsed_s=elapsed_s)
-            applied = self._driver.send(output.position_rad)
-            self._controller.record_applied(applied)
-            if self._base is not None:
-                self._controller.record_driven(output.twist, self._base.drive(output.twist))
+            applied = observation.position_rad if self._device_stopped else self._command(output)
             self._controller.record_period(output)
             self._publish_telemetry(now_s, observation, output, applied)
         except DriverError as error:
@@ -212,11 +235,43 @@ class ControlLoop:
         start_s = now_s if early else max(self._next_s, time.monotonic() - 2 * self._period_s)
         self._next_s = start_s + self._period_s
 
+    def _command(self, output: ControlOutput) -> tuple[float, ...]:
+        """Send the commands of a period. Returns the applied positions, shape (n,) [rad]."""
+        applied = self._driver.send(output.position_rad)
+        self._controller.record_applied(applied)
+        if self._base is not None:
+            self._controller.record_driven(output.twist, self._base.drive(output.twist))
+        return applied
+
+    def _observe(self) -> Observation:
+        """The newest valid measurement.
+
+        Raises:
+            DriverError: The device does not respond, or its measurement is invalid or outdated.
+        """
+        observation = self._driver.observe()
+        measurement.check(observation, joints=self._joints, now_s=time.monotonic())
+        return observation
+
+    def _update_device_stop(self, observation: Observation) -> None:
+        """Latch Stop and follow the measured position while the device reports that it has stopped itself."""
+        if self._reports_faults is None:
+            return
+        self._device_faults = tuple(self._reports_faults.faults())
+        reason = next((fault.message[:2000] for fault in self._device_faults if fault.stops), None)
+        if reason is not None:
+            latch = StopLatch(caller="the device", reason=reason, at_ms=wall_ms(), verified=True)
+            self._controller.follow_device_stop(latch, observation.position_rad)
+        elif self._device_stopped:
+            self._controller.clear_fault(observation.position_rad)
+        self._device_stopped = reason is not None
+
     def _elapsed_s(self, now_s: float) -> float:
         """Time since the start of the present period [s]."""
         return min(max(now_s - (self._next_s - self._period_s), _MIN_ELAPSED_S), self._period_s)
 
     def _handle_fault(self) -> None:
+        self._device_faults = ()  # unknown
         self._controller.set_fault(self._error)
         self._controller.record_period(self._controller.update(time.monotonic()))
         self._thread.beat(_CONNECT_S)
@@ -224,7 +279,7 @@ class ControlLoop:
             self._thread.beat(_CONNECT_S)
             with contextlib.suppress(DriverError):
                 self._driver.connect()
-                self.observation = self._driver.observe()
+                self.observation = self._observe()
                 self._controller.clear_fault(self.observation.position_rad)
                 self._error = ""
                 return

@@ -141,6 +141,19 @@ class Controller:
             if self._state.authority.clear_fault():
                 self._state.goals.start_at(position_rad)
 
+    def follow_device_stop(self, latch: StopLatch, position_rad: Sequence[float]) -> None:
+        """Latch Stop, and be at rest at ``position_rad``, shape (n,) [rad], until ``clear_fault``.
+
+        The device has stopped itself for the reason of ``latch``. If Stop is reset before, it is latched again.
+        """
+        with self._lock:
+            authority = self._state.authority
+            if authority.fault != latch.reason:
+                authority.set_fault(latch.reason)
+            if authority.latch is None:
+                authority.stop(latch)
+            self._state.goals.start_at(position_rad)
+
     # ------------------------------------------------------------ setpoints
 
     def accept_setpoint(self, setpoint: Setpoint, *, now_s: float, tick_ms: int) -> None:

@@ -14,7 +14,7 @@ from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.driver import Observation
 from device_agent.ports.sensor import Camera, Reducible, SensorError
 from device_agent.ports.threads import Recovery, SupervisedThread
-from device_agent.protocol import MAX_VALUES, Measurements, Mode
+from device_agent.protocol import MAX_VALUES, Fault, Measurements, Mode
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.control.command_arbiter import ControlOutput
@@ -92,6 +92,10 @@ class SensorLoop:
             self._set_fault(str(error))
         self._room_device.watchdog.reset()
         self._thread.start()
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Faults of the streams; none while the sensor itself has a fault."""
+        return () if self._controller.fault is not None else self._room_device.watchdog.faults()
 
     def stop(self) -> None:
         """End the thread. May be called twice."""
