@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from device_agent.cli import devices, doctor, enroll, load_test, models, run
+from device_agent.cli import devices, doctor, enroll, load_test, models, new_driver, run
 from device_agent.config.errors import ConfigError
 from device_agent.load_generator.options import LoadTestError
 from device_agent.ports.driver import DriverError
@@ -15,7 +15,7 @@ from device_agent.protocol.security import log_output, private_folder
 from device_agent.runtime.storage.journal import JournalError
 from device_agent.transports.http.client import CloudError
 
-_COMMANDS = (enroll, run, doctor, devices, models, load_test)
+_COMMANDS = (enroll, run, doctor, devices, models, new_driver, load_test)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

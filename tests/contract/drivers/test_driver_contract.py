@@ -1,4 +1,4 @@
-"""The drivers of the project fulfil the contract of their port."""
+"""The simulation's driver fulfils the contract of its port."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,16 +7,51 @@ import pytest
 
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import MujocoDriver, Placement, World
-from device_agent.ports.driver import Driver, ReportsStreams
+from device_agent.drivers.testing.driver_contract import DriverContract
+from device_agent.drivers.testing.peer import Disturbance
+from device_agent.ports.driver import Driver, ReportsStreams, Twist
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
-from tests.contract.drivers.suite import DriverContract
 from tests.harness.paths import ROBOTS
 
 TYPES = sorted(path.parent.name for path in ROBOTS.glob("*/robot.toml"))
 
 
-class TestMujocoAlone(DriverContract):
+class SimulatedPeer:
+    """The robot in the world of its driver."""
+
+    def __init__(self, driver: MujocoDriver) -> None:
+        self._driver = driver
+
+    def joint_positions(self) -> tuple[float, ...]:
+        return tuple(self._driver._world.snapshot().qpos[self._driver._qpos].tolist())
+
+    def joint_velocities(self) -> tuple[float, ...]:
+        return tuple(self._driver._world.snapshot().qvel[self._driver._dof].tolist())
+
+    def base_twist(self) -> Twist:
+        assert isinstance(self._driver, ReportsStreams)
+        self._driver.observe()
+        return Twist(float(self._driver.report("odometry").get("forward_m_s", 0.0)))
+
+    def disturb(self, disturbance: Disturbance) -> None:
+        raise NotImplementedError(disturbance)
+
+    def restore(self) -> None:
+        raise NotImplementedError
+
+
+class MujocoContract(DriverContract):
+    simulated = True
+    absent = dict.fromkeys(Disturbance, "the simulation runs in the agent's process and has no safety controller")
+
+    @pytest.fixture
+    def peer(self, driver: Driver) -> SimulatedPeer:
+        assert isinstance(driver, MujocoDriver)
+        return SimulatedPeer(driver)
+
+
+class TestMujocoAlone(MujocoContract):
     """Each shipped type in its own scene, as the agent loads it."""
 
     @pytest.fixture(params=TYPES)
@@ -29,13 +64,8 @@ class TestMujocoAlone(DriverContract):
         yield driver
         driver.close()
 
-    def base_m_s(self, driver: Driver) -> float:
-        assert isinstance(driver, ReportsStreams)
-        driver.observe()
-        return float(driver.report("odometry").get("forward_m_s", 0.0))
 
-
-class TestMujocoShared(DriverContract):
+class TestMujocoShared(MujocoContract):
     """The second of two UR5s in one world, turned and away from the origin."""
 
     @pytest.fixture
