@@ -32,4 +32,4 @@ class StorageServices(Ports):
 
     @cached_property
     def reminders(self) -> Reminders:
-        return Reminders(tables=self.tables)
+        return Reminders(tables=self.tables, clock=self.clock)

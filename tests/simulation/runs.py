@@ -1,7 +1,7 @@
 """Runs simulations by seed, and reports failures as a minimal plan."""
 
 import os
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from typing import NamedTuple
@@ -12,11 +12,6 @@ from tests.simulation.plan import Step, create
 from tests.simulation.shrink import shrink
 from tests.simulation.world import World
 
-PENDING: dict[str, frozenset[str]] = {
-    "blocked (device-busy)": frozenset({"cloud_clock"}),
-    "not-terminal (clock)": frozenset({"cloud_clock"}),
-}
-"""Violations of known defects: kind → faults, of which the plan must contain one. Remove an entry with its defect."""
 BATCH = 25
 
 
@@ -42,18 +37,12 @@ def run(seed: int, steps: Sequence[Step] | None = None, *, defect: str = "") -> 
         return World(seed).run(create(seed) if steps is None else steps)
 
 
-def unexpected(violations: Iterable[Violation], steps: Sequence[Step]) -> list[Violation]:
-    """The violations that no known defect explains."""
-    faults = {step.kind for step in steps if not step.who}
-    return [each for each in violations if not faults & PENDING.get(each.kind, frozenset())]
-
-
 def run_batch(seeds: Sequence[int], defect: str = "") -> list[Outcome]:
     """Run some seeds, in this process."""
     outcomes = []
     for seed in seeds:
         history = run(seed, defect=defect)
-        outcomes.append(Outcome(seed, history.digest, tuple(unexpected(history.violations, create(seed)))))
+        outcomes.append(Outcome(seed, history.digest, tuple(history.violations)))
     return outcomes
 
 
@@ -76,18 +65,16 @@ def minimal(seed: int, kind: str, *, defect: str = "") -> list[Step]:
 
 def report(seed: int, *, defect: str = "") -> str:
     """Seed, violations, and the minimal plan of the first one, readable."""
-    plan = create(seed)
     violations = run(seed, defect=defect).violations
-    found = unexpected(violations, plan) or violations
-    if not found:
+    if not violations:
         return f"seed {seed}: no violation"
-    steps = minimal(seed, found[0].kind, defect=defect)
+    steps = minimal(seed, violations[0].kind, defect=defect)
     numbers = ",".join(str(step.number) for step in steps)
     replay = f"python -m tests.simulation --seed {seed} --steps {numbers}" + (f" --planted {defect}" if defect else "")
     lines = [
         f"seed {seed}: {len(violations)} violations",
-        *(f"  {violation}" for violation in found),
-        f"minimal plan for '{found[0].kind}':",
+        *(f"  {violation}" for violation in violations),
+        f"minimal plan for '{violations[0].kind}':",
         *(f"  {step}" for step in steps),
         f"replay with a trace: {replay}",
     ]

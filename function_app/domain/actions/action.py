@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Self
 
+from function_app.domain.common.timestamps import CLOCK_SKEW_MS
+
 _TERMINAL_RANK = 6
 
 
@@ -125,7 +127,7 @@ class Action:
     @property
     def ended_ms(self) -> int:
         """When it ended [ms since 1970], limited to plausible times because agent clocks may be wrong."""
-        return min(max(self.times.get(self.status.value, self.created_ms), self.created_ms), self.deadline_ms)
+        return max(min(self.times.get(self.status.value, self.created_ms), self.deadline_ms), self.created_ms)
 
     @property
     def expires_ms(self) -> int:
@@ -259,6 +261,32 @@ def next_check_ms(action: Action, now_ms: int) -> int:
     return action.deadline_ms
 
 
+def after_set_back(action: Action, now_ms: int) -> Action:
+    """The action with time limits that start now, if the cloud's clock was set back since they were written.
+
+    The same object if its limits are plausible. When the command was issued does not change, because republished
+    commands are equal.
+    """
+    if action.status is Status.QUEUED:
+        ahead_ms = action.created_ms - now_ms
+        if ahead_ms <= CLOCK_SKEW_MS:
+            return action
+        return replace(
+            action,
+            created_ms=now_ms,
+            queued_until_ms=action.queued_until_ms - ahead_ms,
+            deadline_ms=action.deadline_ms - ahead_ms,
+        )
+    if action.status is Status.UNKNOWN:
+        since_ms = action.times[Status.UNKNOWN.value]
+        times = {**action.times, Status.UNKNOWN.value: now_ms}
+        return replace(action, times=times) if since_ms > now_ms + CLOCK_SKEW_MS else action
+    limit_ms = now_ms + action.timeout_ms
+    if action.status.terminal or action.deadline_ms <= limit_ms + CLOCK_SKEW_MS:
+        return action
+    return replace(action, deadline_ms=limit_ms)
+
+
 class NextStep(StrEnum):
     """What the timer must do with an open action.
 
@@ -289,7 +317,7 @@ def next_step(action: Action, now_ms: int) -> NextStep:
     if action.status is Status.QUEUED:
         return NextStep.EXPIRE if now_ms >= action.queued_until_ms else NextStep.WAIT
     if action.status is Status.UNKNOWN:
-        if now_ms < action.expires_ms:
+        if now_ms < min(action.expires_ms, action.times[Status.UNKNOWN.value] + action.ttl_ms):
             return NextStep.CANCEL  # the device would start it
         return NextStep.LOSE if now_ms >= action.issued_ms + JOURNAL_MS else NextStep.ASK
     return _step_in_slot(action, now_ms)
@@ -298,8 +326,9 @@ def next_step(action: Action, now_ms: int) -> NextStep:
 def _step_in_slot(action: Action, now_ms: int) -> NextStep:
     acknowledged = action.status.rank >= Status.RECEIVED.rank
     limit_ms = action.deadline_ms if acknowledged else action.expires_ms
-    if now_ms >= limit_ms + GRACE_MS:
-        return NextStep.DOUBT
+    set_back = not acknowledged and action.issued_ms > now_ms + CLOCK_SKEW_MS
+    if set_back or now_ms >= limit_ms + GRACE_MS:
+        return NextStep.DOUBT  # after the clock was set back it is not known whether the time to live has ended
     if now_ms >= limit_ms:
         return NextStep.CANCEL if acknowledged else NextStep.ASK
     if acknowledged:

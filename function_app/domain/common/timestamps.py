@@ -7,6 +7,12 @@ LAST_MS = 9_999_999_999_999
 NEVER_MS = 2**53
 """Expiry time that means "does not expire" [ms since 1970]."""
 
+CLOCK_SKEW_MS = 60_000
+"""Highest difference between clocks of the cloud's processes [ms].
+
+A time that is further ahead than it was when it was written shows that the clock was set back.
+"""
+
 
 def rfc3339(at_ms: int) -> str:
     """Milliseconds since 1970 as ``2026-01-31T12:00:00.123Z``."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from function_app.domain.common.problems import Problem
-from function_app.domain.common.timestamps import rfc3339
+from function_app.domain.common.timestamps import CLOCK_SKEW_MS, rfc3339
 from function_app.domain.identity.accounts import Identity
 
 Outcome = Literal["open", "accepted", "rejected", "withdrawn", "expired", "ended"]
@@ -77,8 +77,8 @@ class Lease:
     request: ControlRequest | None = None
 
     def is_live(self, now_ms: int) -> bool:
-        """Whether a session holds the lease."""
-        return bool(self.account) and now_ms < self.expires_ms
+        """Whether a session holds the lease. An end that is too far ahead is from before the clock was set back."""
+        return bool(self.account) and 0 < self.expires_ms - now_ms <= self.lease_ms + CLOCK_SKEW_MS
 
     def held_by(self, caller: Identity) -> bool:
         """Whether this sign-in session is the holder, also after expiry."""

@@ -12,6 +12,7 @@ from function_app.domain.actions.action import (
     Action,
     NextStep,
     Status,
+    after_set_back,
     end,
     is_withdrawn,
     next_check_ms,
@@ -20,6 +21,7 @@ from function_app.domain.actions.action import (
 )
 from function_app.domain.common.ids import CLAIM_ALPHABET
 from function_app.domain.common.problems import Problem
+from function_app.domain.common.timestamps import CLOCK_SKEW_MS
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
@@ -107,6 +109,7 @@ class Scheduler:
         self._keep_actions_ms = keep_actions_ms
         self._clock = clock
         self._turn = 0
+        self._ran_ms: int | None = None
         self._checks = {
             control_events_.REMINDER: control_events.check,
             audit_log_.REMINDER: audit_log.check,
@@ -118,6 +121,10 @@ class Scheduler:
 
         ``current``: the ingest has stored all messages that have arrived. Otherwise no outcome becomes unknown.
         """
+        now_ms = self._clock.now_ms()
+        if self._ran_ms is None or now_ms < self._ran_ms - CLOCK_SKEW_MS:
+            await self._reminders.repeat_early(written_after_ms=now_ms + CLOCK_SKEW_MS)
+        self._ran_ms = now_ms
         for shard in range(SHARDS):
             for action, note in await self._reminders.due(shard, self._clock.now_ms()):
                 try:
@@ -164,6 +171,10 @@ class Scheduler:
                 await self._reminders.cancel(note)
             return
         await self._control_events.publish(result.action.device)
+        result = (
+            await self._queues.change(action_id, lambda action: after_set_back(action, now_ms), existing=result)
+            or result
+        )
         verdict = next_step(result.action, now_ms)
         if verdict is NextStep.DOUBT and not current:
             verdict = NextStep.ASK

@@ -46,6 +46,7 @@ class BrokerTicket(NamedTuple):
     client_id: str
     credentials: Credentials
     subscribe: tuple[str, ...]
+    confirmations: str
 
 
 class AgentMachine:
@@ -202,7 +203,8 @@ class AgentMachine:
             if row is None or not row.claimed or self.pairing is None or row.space != self.pairing.space:
                 return None
             issued = await functions.mqtt_credentials.agent(row)
-            return BrokerTicket(row.space, issued.client_id, issued.credentials, issued.subscribe)
+            assert issued.confirmations is not None
+            return BrokerTicket(row.space, issued.client_id, issued.credentials, issued.subscribe, issued.confirmations)
 
         ticket: BrokerTicket | None = self._http(request)
         if ticket is None:

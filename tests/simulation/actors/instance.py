@@ -124,6 +124,7 @@ class Instance:
 
         async def handle(topic: str, payload: bytes) -> None:
             await ingest(functions, topic, payload)
+            await functions.confirmations.publish([(topic, payload)])
 
         async def sweep() -> None:
             while True:

@@ -7,15 +7,14 @@ from tests.simulation.checks.robots import RobotChecks
 from tests.simulation.checks.rows import RowChecks
 
 
-def check(history: History, rows: RowChecks, robots: RobotChecks, *, clock_jumped: bool) -> None:
+def check(history: History, rows: RowChecks, robots: RobotChecks) -> None:
     """Every action has one terminal state, and it is the one of the robot."""
     at_robot = {action: status for model in robots.models.values() for action, status in model.ended.items()}
     for action, fact in rows.actions.items():
         shown = f"action {action[-6:]}: {fact.status.value} {fact.code}".rstrip()
         ended = at_robot.get(action)
         if not fact.status.terminal:
-            kind = "not-terminal (clock)" if clock_jumped else "not-terminal"
-            history.violate(kind, f"{shown} in the cloud, {ended} at the robot")
+            history.violate("not-terminal", f"{shown} in the cloud, {ended} at the robot")
         elif fact.exempt or fact.code == UNPAIRED:  # the cloud does not wait for an unpaired robot
             continue
         elif ended == "done" and fact.status is not Status.DONE:

@@ -7,6 +7,7 @@ from device_agent.ports.clock import wall_ms
 from device_agent.ports.transport import LinkChanged, Receive
 from device_agent.protocol import KINDS, PROTOCOL, Presence, codec, topics
 from device_agent.runtime.storage.journal import JournalError
+from device_agent.transports.mqtt.confirmations import Confirmations
 from device_agent.transports.mqtt.transport import KEEP_ALIVE_S, SILENCE_TIMEOUT_S
 from tests.simulation.network.broker import Link, Packet
 
@@ -28,6 +29,7 @@ class SimulatedTransport:
         self._inbox: Any = machine.world.modules.queue.SimpleQueue()
         self._stopping = self._threading.Event()
         self._link: Link | None = None
+        self._confirmations = Confirmations()
         self._delivered: dict[int, Callable[[], None] | None] = {}
         self._number = 0
         self._up = False
@@ -46,6 +48,8 @@ class SimulatedTransport:
         if self._link is None or not self._up:
             return False
         number = 0
+        if delivered is not None and self._confirmations.expect(topic, payload, delivered):
+            delivered = None
         if qos:
             self._number += 1
             number = self._number
@@ -84,6 +88,7 @@ class SimulatedTransport:
             self._machine.name, ticket.client_id, ticket.credentials, client, will=will, keep_alive_s=KEEP_ALIVE_S
         )
         self._delivered = {}
+        self._confirmations.filter = ticket.confirmations
         started_s = self._traffic_s = pinged_s = world.loop.time()
         was_up = False
         try:
@@ -120,7 +125,7 @@ class SimulatedTransport:
     def _handle(self, link: Link, ticket: "BrokerTicket", kind: str, value: Any) -> None:
         match kind:
             case "connected" if value:
-                link.subscribe(dict.fromkeys(ticket.subscribe, 1))
+                link.subscribe(dict.fromkeys((*ticket.subscribe, ticket.confirmations), 1))
             case "subscribed" if value:
                 self._up = True
                 link.publish(Packet(topics.conn(ticket.space, ticket.client_id), self._presence(online=True), 1, True))
@@ -128,7 +133,8 @@ class SimulatedTransport:
             case "connected" | "subscribed":
                 self._inbox.put(("closed", None))
             case "packet":
-                self._receive(value.topic, value.payload)
+                if not self._confirmations.receive(value.topic, value.payload):
+                    self._receive(value.topic, value.payload)
                 if value.qos:
                     link.acknowledge(value.number)
             case "published":

@@ -53,6 +53,15 @@ def test_a_lease_excludes_other_sessions_until_it_expires(cloud: Cloud, anna: Pe
     assert problem(anna.take_lease(robot.device, epoch=1), 409, "lease-lost")["current_epoch"] == 2
 
 
+def test_a_lease_ends_although_the_clock_is_set_back(cloud: Cloud, anna: Person, robot: Robot) -> None:
+    anna.take_lease(robot.device, lease_ms=1_000)
+    cloud.clock.advance(-30)
+    problem(cloud.sign_in("anna").take_lease(robot.device), 409, "lease-held")
+    cloud.clock.advance(-3600)
+    elsewhere = cloud.sign_in("anna")
+    assert elsewhere.take_lease(robot.device).json()["epoch"] == 2
+
+
 def test_a_lease_is_unconfirmed_without_an_ack_of_the_robot(anna: Person, robot: Robot) -> None:
     robot.silent = True
     assert anna.take_lease(robot.device, wait_ms=100).json()["confirmed"] is False

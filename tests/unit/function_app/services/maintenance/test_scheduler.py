@@ -256,3 +256,59 @@ def test_an_account_killed_after_any_write_is_completed(cloud: Cloud, crashing: 
         anna = cloud.sign_in(f"anna{writes}")
         assert len(anna.get("/spaces").json()["items"]) == 1
         assert cloud.run(cloud.functions.sign_in.named(anna.account)) == f"anna{writes}"
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+@pytest.mark.parametrize("state", ["published", "started", "unknown"])
+def test_an_action_frees_its_device_although_the_clock_is_set_back(
+    cloud: Cloud, anna: Person, robot: Robot, state: str, restarted: bool
+) -> None:
+    robot.silent = state != "started"
+    wait_ms = 10_000 if state == "started" else 0
+    action = anna.start(robot.device, wait_ms=wait_ms, ttl_ms=2_000, timeout_ms=6_000).json()["id"]
+    pass_time(cloud, 6 if state == "unknown" else 1)
+    assert anna.action(action)["status"] == state
+    cloud.clock.advance(-3600)
+    anna = cloud.sign_in("anna")
+    if restarted:
+        del cloud.functions.scheduler  # created again at the next use
+    pass_time(cloud, 12)
+    assert anna.action(action)["status"] == "unknown"
+    robot.silent = False
+    assert anna.start(robot.device, wait_ms=10_000).status_code == 200
+    copies = len(robot.payloads[action])
+    pass_time(cloud, 40, step_s=5)
+    assert len(robot.payloads[action]) > copies, "the device is asked how it ended"
+    robot.report(action, AckStatus.DONE)
+    assert anna.action(action)["status"] == "done"
+
+
+def test_a_running_action_keeps_its_time_limit_when_the_clock_is_set_back(
+    cloud: Cloud, anna: Person, robot: Robot
+) -> None:
+    action = anna.start(robot.device, wait_ms=10_000, timeout_ms=6_000).json()["id"]
+    cloud.clock.advance(-3600)
+    anna = cloud.sign_in("anna")
+    pass_time(cloud, 5)
+    assert (anna.action(action)["status"], robot.received(CancelAction)) == ("started", [])
+    robot.report(action, AckStatus.DONE)
+    assert anna.action(action)["status"] == "done"
+
+
+def test_a_queued_action_expires_although_the_clock_is_set_back(cloud: Cloud, anna: Person, robot: Robot) -> None:
+    anna.start(robot.device, wait_ms=10_000, timeout_ms=60_000)
+    action = anna.start(robot.device, policy="queue", queue_ms=10_000).json()["id"]
+    cloud.clock.advance(-3600)
+    anna = cloud.sign_in("anna")
+    pass_time(cloud, 9)
+    assert anna.action(action)["status"] == "queued"
+    pass_time(cloud, 3)
+    assert anna.action(action)["status"] == "expired"
+
+
+def test_an_expiring_key_keeps_its_reminder_when_the_clock_is_set_back(cloud: Cloud) -> None:
+    reminder = ("key-expires:k", cloud.clock.now_ms() + 7_200_000)
+    cloud.run(cloud.functions.reminders.schedule(*reminder))
+    cloud.clock.advance(-3600)
+    pass_time(cloud, 2)
+    assert reminders(cloud) == [f"{reminder[1]:013d}:{reminder[0]}"]

@@ -79,3 +79,15 @@ def test_a_batch_is_confirmed_in_few_messages_of_bounded_size(cloud: Cloud, robo
 def test_without_a_broker_nothing_is_confirmed(cloud: Cloud, robot: Robot, broker: MemoryBroker) -> None:
     broker.reachable = False
     cloud.run(cloud.functions.confirmations.publish([(robot.topic(topics.ACK), b"{}")]))
+
+
+def test_confirmations_continue_when_the_clock_is_set_back(
+    cloud: Cloud, robot: Robot, broker: MemoryBroker, confirmed: Client
+) -> None:
+    message = (robot.topic(topics.ACK), b"{}")
+    broker.reachable = False
+    cloud.run(cloud.functions.confirmations.publish([message]))
+    broker.reachable = True
+    cloud.clock.advance(-3600)
+    cloud.run(cloud.functions.confirmations.publish([message]))
+    assert stored_ids(confirmed) == {robot.topic(topics.STORED): [message_id(*message)]}
