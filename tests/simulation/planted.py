@@ -33,8 +33,8 @@ def _duplicates_run_again() -> AbstractContextManager[None]:
     """The journal is not consulted for duplicates."""
     begin = Journal.begin
 
-    def begin_always(journal: Journal, device: str, ack: Ack) -> None:
-        begin(journal, device, ack)
+    def begin_always(journal: Journal, device: str, ack: Ack, *, issued_ms: int, epoch: int) -> None:
+        begin(journal, device, ack, issued_ms=issued_ms, epoch=epoch)
 
     return _patched(Journal, "begin", begin_always)
 

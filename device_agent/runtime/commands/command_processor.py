@@ -204,7 +204,7 @@ class CommandProcessor:
             self._record_rejection("wrong_address", "it is addressed to another device", command)
             return
         first = self._publisher.create_ack(command.id, AckStatus.RECEIVED)
-        previous = self._journal.begin(self._name, first, epoch=command.epoch)
+        previous = self._journal.begin(self._name, first, issued_ms=command.issued_at_ms, epoch=command.epoch)
         if previous is not None:
             self._publisher.send_ack(previous)
             return

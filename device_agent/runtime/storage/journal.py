@@ -33,8 +33,8 @@ CREATE TABLE IF NOT EXISTS counters (name TEXT PRIMARY KEY, value INTEGER NOT NU
 _CACHE_KB = 256
 """Rows are accessed individually by key, so a larger cache would only use memory [kB]."""
 _KEEP_MS = 8 * 24 * 3600 * 1000
-"""Commands are stored for this time [ms]: longer than any ``ttl_ms`` (at most a day), so that none runs twice, and than
-the week in which the cloud asks for their outcome."""
+"""Commands are stored for this time after their issue [ms]: longer than any ``ttl_ms`` (at most a day), so that none
+runs twice, and than the week in which the cloud asks for their outcome."""
 
 
 class JournalError(Exception):
@@ -59,7 +59,13 @@ class Journal:
         self._database: sqlite3.Connection | None = None
 
     def open(self, *, now_ms: int) -> None:
-        """Open or create the file, and delete commands older than eight days.
+        """Open or create the file, and delete commands that were issued more than eight days ago.
+
+        The cloud's clock decides, as the newest command shows it. If either clock was wrongly set ahead, the other one
+        prevents that commands are deleted whose duplicates may still arrive.
+
+        Args:
+            now_ms: The agent's wall clock [ms since 1970].
 
         Raises:
             JournalError: The file cannot be read, or is not a journal.
@@ -70,7 +76,10 @@ class Journal:
             self._database.execute("PRAGMA synchronous=NORMAL")
             self._database.execute(f"PRAGMA cache_size=-{_CACHE_KB}")
             self._database.executescript(_SCHEMA)
-            self._database.execute("DELETE FROM commands WHERE terminal = 1 AND at_ms < ?", (now_ms - _KEEP_MS,))
+            self._database.execute(
+                "DELETE FROM commands WHERE terminal = 1 AND at_ms < min(?, (SELECT max(at_ms) FROM commands)) - ?",
+                (now_ms, _KEEP_MS),
+            )
         except sqlite3.Error as error:
             raise JournalError(
                 f"the journal {self._path} cannot be used ({error}). Move it away to start with an empty one; the "
@@ -84,12 +93,13 @@ class Journal:
                 self._database.close()
                 self._database = None
 
-    def begin(self, device: str, ack: Ack, *, epoch: int = 0) -> Ack | None:
+    def begin(self, device: str, ack: Ack, *, issued_ms: int, epoch: int = 0) -> Ack | None:
         """Record a command before it is processed; see ``sync``.
 
         Args:
             device: Name of the device.
             ack: Its first ack.
+            issued_ms: When the cloud issued it, by the cloud's clock [ms since 1970].
             epoch: Its epoch.
 
         Returns:
@@ -99,7 +109,7 @@ class Journal:
         with self._lock:
             rows = self._execute(
                 "INSERT INTO commands VALUES (?, ?, ?, ?, 0, ?) ON CONFLICT (id) DO NOTHING RETURNING id",
-                (ack.id, device, codec.encode(ack), ack.status.terminal, ack.at_ms),
+                (ack.id, device, codec.encode(ack), ack.status.terminal, issued_ms),
             )
             if rows:
                 return None
@@ -108,7 +118,7 @@ class Journal:
                 return last
             self._execute(
                 "UPDATE commands SET last_ack = ?, terminal = ?, delivered = 0, at_ms = ? WHERE id = ?",
-                (codec.encode(ack), ack.status.terminal, ack.at_ms, ack.id),
+                (codec.encode(ack), ack.status.terminal, issued_ms, ack.id),
             )
             return None
 
@@ -116,9 +126,8 @@ class Journal:
         """Record the newest ack of a command; a terminal ack is on disk when this returns."""
         with self._lock, self._on_disk() if ack.status.terminal else contextlib.nullcontext():
             self._execute(
-                "UPDATE commands SET last_ack = ?, terminal = ?, delivered = 0, at_ms = ? "
-                "WHERE id = ? AND terminal = 0",
-                (codec.encode(ack), ack.status.terminal, ack.at_ms, ack.id),
+                "UPDATE commands SET last_ack = ?, terminal = ?, delivered = 0 WHERE id = ? AND terminal = 0",
+                (codec.encode(ack), ack.status.terminal, ack.id),
             )
 
     def sync(self) -> None:

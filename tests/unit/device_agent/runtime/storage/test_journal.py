@@ -16,6 +16,8 @@ def ack(command: str, status: AckStatus = AckStatus.RECEIVED, sequence: int = 1,
     return Ack(id=command, status=status, sequence=sequence, at_ms=at_ms, tick_ms=1)
 
 
+DAY_MS = 24 * 3600 * 1000
+
 OpenJournal = Callable[..., Journal]
 
 
@@ -40,39 +42,39 @@ def journal(open_journal: OpenJournal) -> Journal:
 
 
 def test_a_command_is_recorded_once_and_its_terminal_ack_is_final(journal: Journal) -> None:
-    assert journal.begin("arm", ack("c1")) is None
+    assert journal.begin("arm", ack("c1"), issued_ms=1) is None
     for sequence, status in enumerate((AckStatus.STARTED, AckStatus.DONE, AckStatus.FAILED), 2):
         journal.record(ack("c1", status, sequence))
-        stored = journal.begin("arm", ack("c1"))
+        stored = journal.begin("arm", ack("c1"), issued_ms=1)
         assert stored is not None
         assert stored.status is (AckStatus.DONE if status is AckStatus.FAILED else status)
 
 
 def test_a_command_rejected_because_of_its_epoch_is_new_again_with_a_higher_epoch(journal: Journal) -> None:
-    journal.begin("arm", ack("c1"), epoch=1)
+    journal.begin("arm", ack("c1"), issued_ms=1, epoch=1)
     rejected = msgspec.structs.replace(
         ack("c1", AckStatus.FAILED, 2), reason=Reason(code="stale_epoch", message="", epoch=7)
     )
     journal.record(rejected)
     for epoch in (1, 6, 7):
-        assert journal.begin("arm", ack("c1"), epoch=epoch) == rejected
-    assert journal.begin("arm", ack("c1"), epoch=8) is None
+        assert journal.begin("arm", ack("c1"), issued_ms=1, epoch=epoch) == rejected
+    assert journal.begin("arm", ack("c1"), issued_ms=1, epoch=8) is None
     assert tuple(journal.undelivered("arm").values()) == (ack("c1"),)
     for status in (AckStatus.STARTED, AckStatus.DONE):
         journal.record(ack("c1", status, 2))
         for epoch in (1, 7, 8, 9):
-            assert journal.begin("arm", ack("c1"), epoch=epoch) == ack("c1", status, 2)
+            assert journal.begin("arm", ack("c1"), issued_ms=1, epoch=epoch) == ack("c1", status, 2)
 
 
 def test_open_commands_of_a_previous_run_are_failed(open_journal: OpenJournal) -> None:
     before = open_journal()
-    before.begin("arm", ack("c1"))
+    before.begin("arm", ack("c1"), issued_ms=1)
     before.record(ack("c1", AckStatus.STARTED, 2))
-    before.begin("arm", ack("c2"))
+    before.begin("arm", ack("c2"), issued_ms=1)
     before.record(ack("c2", AckStatus.DONE, 2))
     after = open_journal(now_ms=5)
     assert after.end_open(now_ms=5, tick_ms=5) == 1
-    stored = after.begin("arm", ack("c1"))
+    stored = after.begin("arm", ack("c1"), issued_ms=1)
     assert stored is not None
     assert (stored.status, stored.sequence) == (AckStatus.FAILED, 3)
     assert stored.reason is not None
@@ -81,7 +83,7 @@ def test_open_commands_of_a_previous_run_are_failed(open_journal: OpenJournal) -
 
 def test_acks_are_undelivered_until_the_newest_is_delivered(journal: Journal) -> None:
     first, second = ack("c1"), ack("c1", AckStatus.DONE, 2)
-    journal.begin("arm", first)
+    journal.begin("arm", first, issued_ms=1)
     journal.record(second)
     journal.delivered(first)
     assert list(journal.undelivered("arm").values()) == [second]
@@ -93,7 +95,7 @@ def test_acks_are_undelivered_until_the_newest_is_delivered(journal: Journal) ->
 def test_undelivered_acks_are_read_in_parts(journal: Journal) -> None:
     acks = [ack(f"c{number}") for number in range(3)]
     for each in acks:
-        journal.begin("arm", each)
+        journal.begin("arm", each, issued_ms=1)
     first = journal.undelivered("arm", limit=2)
     assert list(first.values()) == acks[:2]
     assert list(journal.undelivered("arm", after=max(first), limit=2).values()) == acks[2:]
@@ -125,14 +127,19 @@ def test_session_numbers_increase(open_journal: OpenJournal) -> None:
     assert numbers == [1, 2, 3, 4]
 
 
-def test_old_terminal_commands_are_deleted(open_journal: OpenJournal) -> None:
+@pytest.mark.parametrize(("now_ms", "newest_ms"), [(0, 9 * DAY_MS), (400 * DAY_MS, 0), (9 * DAY_MS, 9 * DAY_MS)])
+def test_old_terminal_commands_are_deleted_if_both_clocks_agree(
+    open_journal: OpenJournal, now_ms: int, newest_ms: int
+) -> None:
     before = open_journal()
-    before.begin("arm", ack("old"))
-    before.record(ack("old", AckStatus.DONE, 2))
-    before.begin("arm", ack("open"))
-    after = open_journal(now_ms=9 * 24 * 3600 * 1000)
-    assert after.begin("arm", ack("old")) is None
-    assert after.begin("arm", ack("open")) is not None
+    for command in ("old", "open"):
+        before.begin("arm", ack(command), issued_ms=1000)
+    before.record(ack("old", AckStatus.DONE, 2, at_ms=400 * DAY_MS))
+    before.begin("arm", ack("new"), issued_ms=newest_ms)
+    after = open_journal(now_ms=now_ms)
+    deleted = after.begin("arm", ack("old"), issued_ms=1000) is None
+    assert deleted is (min(now_ms, newest_ms) > 0)
+    assert after.begin("arm", ack("open"), issued_ms=1000) is not None
 
 
 def test_an_invalid_journal_file_is_named_and_not_deleted(tmp_path: Path) -> None:
@@ -158,7 +165,7 @@ def test_sync_writes_to_disk_without_blocking_writers(
 ) -> None:
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_ino))
-    journal.begin("arm", ack("1", AckStatus.RECEIVED))
+    journal.begin("arm", ack("1", AckStatus.RECEIVED), issued_ms=1)
     with journal._lock:
         journal.sync()
     assert synced == [next(tmp_path.glob("*-wal")).stat().st_ino]

@@ -49,7 +49,7 @@ class PublisherFixture:
         return True
 
     def command(self, name: str) -> None:
-        self.journal.begin("arm", self.publisher.create_ack(name, AckStatus.RECEIVED))
+        self.journal.begin("arm", self.publisher.create_ack(name, AckStatus.RECEIVED), issued_ms=1)
         self.publisher.report(name, AckStatus.DONE)
 
     def run(self, seconds: float) -> None:
@@ -126,7 +126,7 @@ def test_nothing_is_repeated_after_a_full_last_part(fixture: PublisherFixture) -
 def test_a_terminal_ack_is_sent_on_a_full_disk_and_journalled_later(
     fixture: PublisherFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fixture.journal.begin("arm", fixture.publisher.create_ack("c1", AckStatus.RECEIVED))
+    fixture.journal.begin("arm", fixture.publisher.create_ack("c1", AckStatus.RECEIVED), issued_ms=1)
     record = fixture.journal.record
     monkeypatch.setattr(fixture.journal, "record", Mock(side_effect=JournalError("is the disk full?")))
     with pytest.raises(JournalError):
@@ -138,6 +138,6 @@ def test_a_terminal_ack_is_sent_on_a_full_disk_and_journalled_later(
         fixture.publisher.update_journal()
     monkeypatch.setattr(fixture.journal, "record", record)
     fixture.publisher.update_journal()
-    last = fixture.journal.begin("arm", fixture.publisher.create_ack("c1", AckStatus.RECEIVED))
+    last = fixture.journal.begin("arm", fixture.publisher.create_ack("c1", AckStatus.RECEIVED), issued_ms=1)
     assert last is not None
     assert last.status is AckStatus.DONE
