@@ -245,7 +245,8 @@ class SimulatedRobot:
             elif parsed.kind == topics.STOP:
                 stop = codec.decode(payload, Stop)
                 reason = printable(stop.reason[:2000])
-                self._authority.stop(StopLatch(caller=unverified(parsed.name), reason=reason, at_ms=wall_ms()))
+                latch = StopLatch(caller=unverified(parsed.name), reason=reason, at_ms=wall_ms())
+                self._authority.stop(latch, message=stop.id)
         except (ProtocolError, SignatureError, Refused):
             self.refused += 1
 
@@ -330,7 +331,7 @@ class SimulatedRobot:
                 self._control_request.withdraw(request_id)
             case StopDevice(reason=reason):
                 latch = StopLatch(caller=command.caller, reason=printable(reason), at_ms=wall_ms(), verified=True)
-                self._authority.stop(latch)
+                self._authority.stop(latch, message=command.id)
             case ResetStop():
                 self._authority.fence(command.epoch)
                 self._authority.reset_stop()

@@ -39,9 +39,10 @@ class EventKind(StrEnum):
     LEASE_ENDED = "lease-ended"
     """A lease ended; the device no longer accepts its epoch. ``epoch``, ``holder``, ``code``."""
     STOP_LATCHED = "stop-latched"
-    """Stop latched. ``caller``, ``reason``, ``verified``: whether a signed command names the caller."""
+    """Stop latched. ``stop``: id of the Stop message or command; ``caller``, ``reason``; ``verified``: whether a signed
+    command names the caller."""
     STOP_VERIFIED = "stop-verified"
-    """A signed Stop of ``caller`` followed an unverified one. ``caller``, ``reason``, ``verified``."""
+    """A signed Stop of ``caller`` followed an unverified one. ``stop``, ``caller``, ``reason``, ``verified``."""
     STOP_RESET = "stop-reset"
     """The Stop latch was reset. ``caller``."""
     MOTION_HELD = "motion-held"

@@ -298,7 +298,7 @@ class Device:
         """Latch Stop. Only the broker vouches for the author, so it is shown as unverified."""
         caller = unverified(author)
         reason = printable(stop.reason[:MAX_REASON])
-        self._controller.stop(StopLatch(caller=caller, reason=reason, at_ms=wall_ms()))
+        self._controller.stop(StopLatch(caller=caller, reason=reason, at_ms=wall_ms()), message=stop.id)
         self._wake()
         _log.warning("%s: stopped by %s", self.name, caller)
 

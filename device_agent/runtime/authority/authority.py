@@ -106,9 +106,14 @@ class Authority:
         if self._gate.expire(now_s):
             self.end(Refused("lease_lost", "the lease expired"), previous)
 
-    def stop(self, latch: StopLatch) -> None:
-        """Latch Stop. The first latch remains the one shown, but a verified caller replaces an unverified one."""
-        data = {"caller": latch.caller, "reason": latch.reason, "verified": latch.verified}
+    def stop(self, latch: StopLatch, *, message: str = "") -> None:
+        """Latch Stop. The first latch remains the one shown, but a verified caller replaces an unverified one.
+
+        Args:
+            latch: The latch.
+            message: Id of the Stop message or command, for the event.
+        """
+        data = {"stop": message, "caller": latch.caller, "reason": latch.reason, "verified": latch.verified}
         if self.latch is None:
             self.latch = latch
             self.record(EventKind.STOP_LATCHED, f"stopped by {latch.caller}", data, "warning")

@@ -277,7 +277,7 @@ class CommandProcessor:
                 self._controller.release(epoch=command.epoch)
             case StopDevice(reason=reason):
                 latch = StopLatch(caller=command.caller, reason=printable(reason), at_ms=wall_ms(), verified=True)
-                self._pending_stops[command.id] = self._controller.stop(latch)
+                self._pending_stops[command.id] = self._controller.stop(latch, message=command.id)
                 self._wake()
                 self._confirm_stops()
                 return

@@ -102,10 +102,10 @@ class Controller:
         with self._lock:
             self._state.authority.restrictions.clear(source)
 
-    def stop(self, latch: StopLatch) -> int:
+    def stop(self, latch: StopLatch, *, message: str = "") -> int:
         """Latch Stop; returns its number for ``stop_applied``. See ``Authority.stop``."""
         with self._lock:
-            self._state.authority.stop(latch)
+            self._state.authority.stop(latch, message=message)
             self._state.stops += 1
             return self._state.stops
 

@@ -13,7 +13,7 @@ from typing import Final
 
 from device_agent.protocol import ResetStop, Stop, StopDevice, codec
 from function_app.domain.actions.queue import STOPPED
-from function_app.domain.common.ids import new_id
+from function_app.domain.common.ids import command_id
 from function_app.domain.common.problems import Problem, forbidden
 from function_app.domain.control import lease as rules
 from function_app.domain.control.control_events import Fact
@@ -179,14 +179,16 @@ class StopDevices:
         self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
     ) -> bool:
         """Send the plain message and the signed command; return whether the device confirmed. Writes concurrently."""
-        plain = asyncio.create_task(self._repeat(device, caller.account, Stop(id=new_id(), reason=reason)))
+        now_ms = self._clock.now_ms()
+        stop = command_id(device.id, now_ms)
+        plain = asyncio.create_task(self._repeat(device, caller.account, Stop(id=stop, reason=reason)))
         writing: asyncio.Task[None] | None = None
         try:
             await asyncio.sleep(0)  # publish first, before signing and writing
-            writing = asyncio.create_task(self._write(caller, device, reason, gate))
+            writing = asyncio.create_task(self._write(caller, device, reason, gate, (stop, now_ms)))
             order = StopDevice(reason=reason)
             result = await self._command_sender.send_confirmed(
-                device, order, caller=caller.name, epoch=0, wait_ms=CONFIRM_MS
+                device, order, caller=caller.name, epoch=0, wait_ms=CONFIRM_MS, command=stop
             )
         finally:
             plain.cancel()
@@ -207,9 +209,17 @@ class StopDevices:
             await asyncio.sleep(REPEAT_S)
 
     async def _write(
-        self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
+        self,
+        caller: Identity,
+        device: Device,
+        reason: str,
+        gate: AbstractAsyncContextManager[object],
+        stop: tuple[str, int],
     ) -> None:
-        """Cancel the queue and record the event. The device stops without either, and queued actions would fail."""
+        """Cancel the queue and record the event with the id and time of the Stop.
+
+        The device stops without either, and queued actions would fail.
+        """
         message = f"{caller.name} stopped it: {reason}" if reason else f"{caller.name} stopped it."
         try:
             async with gate:
@@ -221,6 +231,7 @@ class StopDevices:
                     caller=caller,
                     severity="warning",
                     data={"caller": caller.name, "reason": reason},
+                    event=stop,
                 )
         except (Problem, StoreError) as error:
             _log.warning("stop of %s: %s", device.id, error)

@@ -128,10 +128,13 @@ class ControlEvents:
         severity: Any = "info",
         outcome: Outcome = "done",
         data: Mapping[str, Any],
+        event: tuple[str, int] | None = None,
     ) -> None:
-        """Record an event that does not change a lease."""
-        event = await self.add_event(device, fact, message, severity=severity, data=data)
-        await self._audit_log.append(device.owner or CLOUD, _entry(device.id, event, _by(caller), outcome))
+        """Record an event that does not change a lease, first in the audit log. ``event``: its id and time [ms]."""
+        id_, at_ms = event or (new_id(), self._clock.now_ms())
+        fields = ControlEvent(id_, fact, at_ms, message, dict(data), severity).event(device.name)
+        await self._audit_log.append(device.owner or CLOUD, _entry(device.id, fields, _by(caller), outcome))
+        await self._add(device.id, device.pairing, fields)
 
     async def add_event(
         self, device: Device, fact: Fact, message: str, *, severity: Any = "info", data: Mapping[str, Any]

@@ -113,14 +113,16 @@ class CommandSender:
         return True
 
     async def send_confirmed(
-        self, device: Device, request: Request, *, caller: str, epoch: int, wait_ms: int
+        self, device: Device, request: Request, *, caller: str, epoch: int, wait_ms: int, command: str = ""
     ) -> Confirmation:
         """Sign and send a short-lived command; return whether the device accepted it within ``wait_ms``.
+
+        ``command``: its id; empty: a new one.
 
         Raises:
             Problem: ``broker-unavailable``.
         """
-        signed = await self._sign_short_lived(device, request, caller=caller, epoch=epoch)
+        signed = await self._sign_short_lived(device, request, caller=caller, epoch=epoch, command=command)
         try:
             return await self._delivery.send_confirmed(device, signed, wait_ms=wait_ms)
         except BusUnavailable as error:
@@ -145,9 +147,11 @@ class CommandSender:
         signature = signing.sign_text(text, key, context=signing.MOVEMENT_CONTEXT)
         return replace(order, key=name, signature=signature)
 
-    async def _sign_short_lived(self, device: Device, request: Request, *, caller: str, epoch: int) -> SignedCommand:
+    async def _sign_short_lived(
+        self, device: Device, request: Request, *, caller: str, epoch: int, command: str = ""
+    ) -> SignedCommand:
         now_ms = self._clock.now_ms()
-        id_ = command_id(device.id, now_ms)
+        id_ = command or command_id(device.id, now_ms)
         return await self.sign(
             _command(device, id_, request, caller=caller, epoch=epoch, issued_ms=now_ms, ttl_ms=SHORT_TTL_MS)
         )

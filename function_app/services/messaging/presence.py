@@ -24,6 +24,9 @@ from function_app.services.messaging.key_announcer import KeyAnnouncer
 from function_app.services.storage import records
 from function_app.services.telemetry.event_log import EventLog
 
+SAME_STOP_MS = 60_000
+"""Longest time in which the report of a Stop may follow its record [ms]."""
+
 T = TypeVar("T")
 
 
@@ -110,9 +113,16 @@ class PresenceIngest:
             raise ProtocolError("the event's `at_ms` is not a time of milliseconds since 1970")
         device = device_id(topic.agent, topic.device)
         await self._events.add(device, agent.pairing, msgspec.to_builtins(event))
-        if event.kind == EventKind.STOP_LATCHED:
-            # Also a Stop that reached the device over the broker, past the functions.
+        if event.kind == EventKind.STOP_LATCHED and not await self._is_recorded(device, agent.pairing, event):
             await self._audit_log.append_all(agent.account or CLOUD, [_stop_entry(device, event)])
+
+    async def _is_recorded(self, device: str, pairing: str, event: Event) -> bool:
+        """Whether the functions have just sent and recorded this Stop. Others reached the device over the broker.
+
+        The id of a Stop is not secret. A Stop that repeats an old one is therefore recorded.
+        """
+        age_ms = await self._events.command_age_ms(device, pairing, str(event.data.get("stop", "")))
+        return age_ms is not None and age_ms <= SAME_STOP_MS
 
 
 def _stop_entry(device: str, event: Event) -> Entry:

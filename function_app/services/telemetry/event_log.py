@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from function_app.domain.common.ids import new_suffix
+from function_app.domain.common.ids import new_suffix, split_command
 from function_app.domain.common.problems import invalid
 from function_app.domain.devices.devices import Device
 from function_app.ports.clock import Clock
@@ -42,6 +42,14 @@ class EventLog:
             await self._tables.create(records.EVENTS, Row(partition, f"{when}:{event['id']}", data))
         except Conflict:
             return
+
+    async def command_age_ms(self, device: str, pairing: str, command: str) -> int | None:
+        """How long ago the event of a command was stored, which has its id and time; ``None``: there is none."""
+        parts = split_command(command)
+        if parts is None or parts[0] != device:
+            return None
+        row = await self._tables.get(records.EVENTS, _partition(device, pairing), f"{parts[1][:9]}:{command}")
+        return None if row is None else self._clock.now_ms() - int(row.data["seen_ms"])
 
     async def read(
         self, device: Device, *, cursor: str | None, limit: int

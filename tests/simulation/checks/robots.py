@@ -205,7 +205,7 @@ class RobotChecks:
             self._violate("moved-while-stopped", model, "it accepted a setpoint while Stop was latched")
         model.setpoint_s = now_s
 
-    def _stopped(self, model: DeviceModel, latch: Any) -> None:
+    def _stopped(self, model: DeviceModel, latch: Any, **_: Any) -> None:
         self._note(model, f"stop by={latch.caller}")
         model.latched = True
         self._burn(model, model.newest)

@@ -157,13 +157,13 @@ def test_a_signed_stop_replaces_the_unverified_author(harness: DeviceHarness) ->
     latch = wait_for_state(harness, lambda state: state.stop).stop
     assert latch is not None
     assert (latch.caller, latch.reason, latch.verified) == ("bob (unverified)", "a\ufffdforged line", False)
-    harness.done(StopDevice(reason="smoke"))
+    command = harness.done(StopDevice(reason="smoke"))
     harness.done(StopDevice(reason="later"), caller="cat")
     verified = wait_for_state(harness, lambda state: state.stop and state.stop.verified).stop
     assert verified is not None
     assert (verified.caller, verified.reason, verified.at_ms) == ("ann", "smoke", latch.at_ms)
     (event,) = harness.events(EventKind.STOP_VERIFIED)
-    assert event.data == {"caller": "ann", "reason": "smoke", "verified": True}
+    assert event.data == {"stop": command.id, "caller": "ann", "reason": "smoke", "verified": True}
 
 
 def test_stop_needs_no_lease_and_survives_a_restart(harness: DeviceHarness, make_device: MakeDevice) -> None:

@@ -71,6 +71,7 @@ def test_a_stop_in_motion_records_its_effects_once(harness: DeviceHarness) -> No
         harness.receive_stop()
     assert harness.end_code(command) == "stopped"
     assert event(harness, EventKind.STOP_LATCHED).data == {
+        "stop": "s1",
         "caller": "bob (unverified)",
         "reason": "smoke",
         "verified": False,

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import Event, topics
+from device_agent.protocol import Event, StopDevice, topics
 from function_app.domain.audit.hash_chain import CLOUD, Head, entry
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import Conflict
@@ -71,6 +71,22 @@ class TestWhatIsRecorded:
         expected = {"message": "stopped by eve", "caller": stop["actor"], "reason": "smoke", "verified": False}
         assert (stop["target"], stop["data"]) == (robot.device, expected)
         assert verdict(cloud, anna.account) == ""
+
+    @pytest.mark.parametrize(("delay_s", "other_id", "records"), [(5, "", 1), (3600, "", 2), (5, "s1", 2)])
+    def test_a_stop_over_http_is_recorded_once_and_a_replay_of_its_id_again(  # noqa: PLR0917 (fixtures and parameters)
+        self, cloud: Cloud, anna: Person, robot: Robot, delay_s: float, other_id: str, records: int
+    ) -> None:
+        anna.post(f"/devices/{robot.device}/stop", {"reason": "smoke"})
+        (stop,) = {stop.id for stop in robot.stops}
+        assert {command.id for command in robot.received(StopDevice)} == {stop}
+        cloud.clock.advance(delay_s)
+        data = {"stop": other_id or stop, "caller": "anna (unverified)", "reason": "smoke", "verified": False}
+        robot.publish(
+            robot.topic(topics.EVENT),
+            Event(id="e1", device="arm", at_ms=5, kind="stop-latched", severity="warning", message="m", data=data),
+        )
+        wait_until(lambda: len(anna.get(f"/devices/{robot.device}/events").json()["items"]) == 2, "the report")
+        assert [kind for kind in kinds(anna) if kind.startswith("stop")] == ["stop-latched", "stop-ordered"][-records:]
 
     def test_sign_ins_are_recorded_without_secrets(self, cloud: Cloud) -> None:
         anna = cloud.sign_in("anna")
