@@ -111,6 +111,20 @@ def test_a_backup_is_restored_to_another_machine(
         assert anna.get("/robot-types/ur5/movements/mine").json()["source"] == SOURCE
 
 
+def test_a_backup_contains_no_state_of_running_programs(home: Path, tmp_path: Path, run: Run) -> None:
+    with Cloud(cloud_settings(home)) as cloud:
+        cloud.run(cloud.functions.heartbeats.beat("worker", period_ms=1000))
+        cloud.run(cloud.functions.health.check())
+    assert "Workers" in {row[0] for row in rows(home)}
+    assert list((home / "blobs").glob("health*"))
+    file = tmp_path / "running.zip"
+    assert run("backup", file)[0] == 0
+    assert run("restore", file, "--force")[0] == 0
+    assert "Workers" not in {row[0] for row in rows(home)}
+    assert list((home / "blobs").iterdir())
+    assert not list((home / "blobs").glob("health*"))
+
+
 def test_existing_data_are_replaced_only_with_force_and_kept(home: Path, file: Path, run: Run) -> None:
     before = content(home)
     (home / "mosquitto" / "file").write_text("changed")

@@ -27,6 +27,9 @@ FORMAT: Final = 1
 _AUDIT: Final = "blobs/audit"
 _OTHER_PROGRAMS: Final = ("agents", "logs")
 """Not part of the server. An agent with an older journal could run commands twice."""
+_STATE_BLOBS: Final = "blobs/health%2F"
+_STATE_TABLE: Final = "Workers"
+"""Blobs and table of ``ReadinessCheck`` and ``Heartbeats``: the state of running programs."""
 _TRANSIENT: Final = (".lock", ".new", ".part", "-wal", "-shm", "-journal")
 _FILE_MODE: Final = 0o600
 _FOLDER_MODE: Final = 0o700
@@ -168,14 +171,14 @@ def is_empty(home: Path) -> bool:
 
 
 def _paths(home: Path) -> Iterator[str]:
-    """Relative paths of all regular files of the server, except the tables."""
+    """Relative paths of all regular files of the server, except the tables and the state of running programs."""
     for folder, folders, files in os.walk(home):
         place = Path(folder).relative_to(home)
         if place == Path():
             folders[:] = [name for name in folders if name not in _OTHER_PROGRAMS]
         for name in sorted(files):
             path = place / name
-            if path.name.startswith(TABLES) and place == Path():
+            if path.as_posix().startswith((TABLES, _STATE_BLOBS)):
                 continue
             if not name.endswith(_TRANSIENT) and stat.S_ISREG((home / path).lstat().st_mode):
                 yield path.as_posix()
@@ -202,12 +205,14 @@ def _copy(source: Any, target: Any, *, most: int | None = None) -> tuple[int, st
 
 @contextlib.contextmanager
 def _copy_of_tables(tables: Path, copy: Path) -> Iterator[Path]:
-    """A consistent copy of the tables, also while programs write to them."""
+    """A consistent copy of the tables without the state of programs, also while programs write to them."""
     copy.unlink(missing_ok=True)
     os.close(os.open(copy, os.O_CREAT | os.O_WRONLY, _FILE_MODE))
     try:
         with contextlib.closing(sqlite3.connect(tables)) as source, contextlib.closing(sqlite3.connect(copy)) as target:
             source.backup(target)
+            target.execute("DELETE FROM rows WHERE tab = ?", (_STATE_TABLE,))
+            target.commit()
         yield copy
     finally:
         for suffix in ("", "-wal", "-shm", "-journal"):
