@@ -261,6 +261,7 @@ class StreamedArm:
             echo_tick_ms=self._newest.tick_ms,
             sent_ms=now_s * 1000,
             target=JointTarget(position_rad=target),
+            input=self._newest.ended_input + 1,
         )
         self._control.client.publish(self._topic, setpoints.seal(codec.encode(setpoint), self._key, self._topic))
 

@@ -94,7 +94,7 @@ class MemoryCommandBus:
         queues = self._queues.setdefault((f"{device_topic}/{topics.ACK}", command), [])
         queues.append(received)
         try:
-            yield _Acks(received)
+            yield QueuedAcks(received)
         finally:
             queues.remove(received)
 
@@ -114,7 +114,9 @@ class MemoryCommandBus:
                 queue.put_nowait(ack)
 
 
-class _Acks(AsyncIterator[Ack]):
+class QueuedAcks(AsyncIterator[Ack]):
+    """Acks that a connection has received."""
+
     def __init__(self, queue: asyncio.Queue[Ack]) -> None:
         self._queue = queue
 

@@ -15,11 +15,11 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from device_agent.ports.clock import wall_ms
 from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.protocol import KINDS, PROTOCOL, Ack, Presence, codec, topics
+from device_agent.protocol import Ack, codec, topics
 from device_agent.protocol.errors import ProtocolError
+from device_agent.transports import presence
 from device_agent.transports.backoff import BackOff
 from device_agent.transports.http.client import RESPONSE_TIMEOUT_S, CloudClient, CloudError, QueuedCommand
 from device_agent.transports.http.send_queue import Message, SendQueue
@@ -352,13 +352,4 @@ class HttpTransport:
             self._process_results((*batch, last), self._send_api.send(self._agent, payloads, within_s=_DISCONNECT_S))
 
     def _presence(self, *, online: bool) -> bytes:
-        return codec.encode(
-            Presence(
-                online=online,
-                session=self._session,
-                at_ms=wall_ms(),
-                software=self._software,
-                protocol=PROTOCOL,
-                capabilities=KINDS,
-            )
-        )
+        return presence.encode(online=online, session=self._session, software=self._software)

@@ -14,11 +14,10 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from device_agent.ports.clock import wall_ms
 from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.protocol import KINDS, PROTOCOL, Presence, codec, topics
-from device_agent.transports import tls
+from device_agent.protocol import topics
+from device_agent.transports import presence, tls
 from device_agent.transports.backoff import BackOff
 from device_agent.transports.http.client import CloudClient
 from device_agent.transports.http.responses import MqttCredentials
@@ -363,16 +362,7 @@ class MqttTransport:
             self._version = MQTTProtocolVersion.MQTTv311
 
     def _presence(self, *, online: bool) -> bytes:
-        return codec.encode(
-            Presence(
-                online=online,
-                session=self._session,
-                at_ms=wall_ms(),
-                software=self._software,
-                protocol=PROTOCOL,
-                capabilities=KINDS,
-            )
-        )
+        return presence.encode(online=online, session=self._session, software=self._software)
 
 
 class _Renewal:

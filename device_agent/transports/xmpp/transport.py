@@ -15,13 +15,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element
 
-from device_agent.ports.clock import wall_ms
 from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.protocol import KINDS, PROTOCOL, Presence, codec
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.xmpp import stanzas
 from device_agent.protocol.xmpp.stream import Login, Stream, StreamError
+from device_agent.transports import presence
 from device_agent.transports.backoff import BackOff
 
 _CONFIRM_S = 5.0
@@ -196,16 +195,7 @@ class XmppTransport:
         return link.up
 
     def _presence(self, link: "_Link", *, online: bool) -> bytes:
-        return codec.encode(
-            Presence(
-                online=online,
-                session=link.session,
-                at_ms=wall_ms(),
-                software=self._software,
-                protocol=PROTOCOL,
-                capabilities=KINDS,
-            )
-        )
+        return presence.encode(online=online, session=link.session, software=self._software)
 
 
 class _Link:

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from device_agent.ports.clock import wall_ms
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.protocol import KINDS, PROTOCOL, Presence, codec, topics
+from device_agent.protocol import topics
 from device_agent.runtime.storage.journal import JournalError
+from device_agent.transports import presence
 from device_agent.transports.mqtt.confirmations import Confirmations
 from device_agent.transports.mqtt.transport import KEEP_ALIVE_S, SILENCE_TIMEOUT_S
 from tests.simulation.network.broker import Link, Packet
@@ -143,16 +143,7 @@ class SimulatedTransport:
                     delivered()
 
     def _presence(self, *, online: bool) -> bytes:
-        return codec.encode(
-            Presence(
-                online=online,
-                session=self._session,
-                at_ms=wall_ms(),
-                software="simulated",
-                protocol=PROTOCOL,
-                capabilities=KINDS,
-            )
-        )
+        return presence.encode(online=online, session=self._session, software="simulated")
 
 
 class _Callbacks:

@@ -13,6 +13,7 @@ from function_app.ports.broker_access import BrokerAccess, Credentials
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.device_feed import BatchHandler, Handler
 from function_app.ports.tables import StoreError
+from tests.fakes.broker_ports import QueuedAcks
 from tests.simulation.network.broker import Link, Packet
 from tests.simulation.network.wires import CLOUD
 
@@ -198,7 +199,7 @@ class SimulatedBus(CloudConnection):
         queues = self._queues.setdefault((f"{device_topic}/{topics.ACK}", command), [])
         queues.append(received)
         try:
-            yield _Acks(received)
+            yield QueuedAcks(received)
         finally:
             queues.remove(received)
 
@@ -214,14 +215,6 @@ class SimulatedBus(CloudConnection):
             ack = codec.decode(packet.payload, Ack)
             for queue in self._queues.get((packet.topic, ack.id), ()):
                 queue.put_nowait(ack)
-
-
-class _Acks(AsyncIterator[Ack]):
-    def __init__(self, queue: asyncio.Queue[Ack]) -> None:
-        self._queue = queue
-
-    async def __anext__(self) -> Ack:
-        return await self._queue.get()
 
 
 class SimulatedFeed(CloudConnection):
