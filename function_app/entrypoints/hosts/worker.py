@@ -9,6 +9,7 @@ import function_app
 from function_app.bootstrap import Functions
 from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from function_app.ports.model_compiler import CompilerMissingError
+from function_app.ports.tables import StoreError
 from function_app.services.maintenance.heartbeats import HEALTH_TOPICS, JOBS
 
 SWEEP_EVERY_S = 1.0
@@ -72,6 +73,9 @@ async def check_models(functions: Functions, *, drain: bool) -> None:
             busy = await functions.model_checks.run()
         except CompilerMissingError:
             raise
+        except StoreError as error:
+            _log.warning("model checks: %s", error)
+            busy = False
         except Exception:  # noqa: BLE001 (the checker survives an invalid upload, which is rejected after a few attempts)
             _log.exception("model checks")
             busy = False
@@ -100,6 +104,8 @@ async def _sweep(functions: Functions) -> None:
             async with asyncio.timeout(SWEEP_TIMEOUT_S):
                 await functions.scheduler.run_due_jobs(current=ran_s >= current_s)
             functions.heartbeats.ran(JOBS)
+        except StoreError as error:
+            _log.warning("timer: %s", error)
         except Exception:  # noqa: BLE001 (the timer continues after a failed run)
             _log.exception("timer")
         await asyncio.sleep(SWEEP_EVERY_S)
