@@ -10,11 +10,16 @@ from device_agent.cli import devices, doctor, enroll, load_test, models, new_dri
 from device_agent.config.errors import ConfigError
 from device_agent.load_generator.options import LoadTestError
 from device_agent.ports.driver import DriverError
+from device_agent.ports.geometry import GeometryError
 from device_agent.ports.transport import TransportError
 from device_agent.protocol.security import log_output, private_folder
 from device_agent.runtime.storage.journal import JournalError
 from device_agent.transports.http.client import CloudError
 
+_ERRORS = (
+    ConfigError, JournalError, DriverError, GeometryError, TransportError, CloudError, LoadTestError, OSError,
+)  # fmt: skip
+"""Errors that are shown in one line."""
 _COMMANDS = (enroll, run, doctor, devices, models, new_driver, load_test)
 
 
@@ -29,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         log_output.configure(options)
         code: int = options.command(options)
-    except (ConfigError, JournalError, DriverError, TransportError, CloudError, LoadTestError, OSError) as error:
+    except _ERRORS as error:
         print(f"telescope agent: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -17,9 +17,10 @@ from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Driver, DriverError
 from device_agent.ports.floor_map import ObstacleMap
-from device_agent.ports.geometry import GeometryError, RobotGeometry
+from device_agent.ports.geometry import RobotGeometry
 from device_agent.ports.sandbox import Sandbox
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
+from device_agent.ports.tracing import CommandTraces
 from device_agent.ports.transport import Transport
 from device_agent.ports.uploads import Uploads
 from device_agent.protocol import topics
@@ -227,13 +228,20 @@ def cloud_client(
     )
 
 
-def build(store: IdentityStore, *, trace: Path | None = None, metrics: "AgentMetrics | None" = None) -> RunningAgent:
-    """Build the agent of an enrolled and claimed ``store``, ready to start; ``metrics`` measures it.
+def build(
+    store: IdentityStore,
+    *,
+    trace: Path | None = None,
+    metrics: "AgentMetrics | None" = None,
+    traces: CommandTraces | None = None,
+) -> RunningAgent:
+    """Build the agent of an enrolled and claimed ``store``, ready to start; ``metrics`` and ``traces`` measure it.
 
     ``trace``: folder for the ground truth of simulated devices, ``{device}.ndjson`` each.
 
     Raises:
         ConfigError: The agent is not enrolled or claimed, or a file is wrong.
+        GeometryError: The model of a device cannot be used.
         JournalError: The journal cannot be used.
         DriverError: A driver or option is unknown.
     """
@@ -301,6 +309,7 @@ def build(store: IdentityStore, *, trace: Path | None = None, metrics: "AgentMet
             uploads=uploads,
             load=load,
             supervisor=supervisor,
+            traces=traces,
             streaming=configuration.transport != "http",
         )
     if metrics is not None:
@@ -360,6 +369,7 @@ def _device(
     uploads: Uploads,
     load: LoadGovernor,
     supervisor: Supervisor,
+    traces: CommandTraces | None,
     streaming: bool,
 ) -> Device:
     kind = type_of(entry)
@@ -378,19 +388,13 @@ def _device(
         outbox=outbox,
         readings=readings,
         interlocks=entry.interlocks,
-        geometry=_geometry(entry, kind),
+        geometry=load_geometry(entry, kind),
         sandbox=sandbox,
         owner=pairing.owner,
         speech=Espeak(),
         uploads=uploads,
         load=load,
         supervisor=supervisor,
+        traces=traces,
         streaming=streaming,
     )
-
-
-def _geometry(entry: DeviceEntry, kind: RobotType) -> RobotGeometry | None:
-    try:
-        return load_geometry(entry, kind)
-    except GeometryError as error:
-        raise ConfigError(str(error)) from error

@@ -2,11 +2,13 @@
 
 import argparse
 import gc
+import logging
 import os
 import signal
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +20,7 @@ from device_agent.config.agent_config import AgentConfig
 from device_agent.config.errors import ConfigError
 from device_agent.config.identity_store import IdentityStore
 from device_agent.ports.clock import CloudClock
+from device_agent.ports.tracing import CommandTraces, NoTraces
 from device_agent.runtime.supervision import CHECK_PERIOD_S
 
 if TYPE_CHECKING:
@@ -32,6 +35,7 @@ _WATCHDOG_S, _STARTING_WATCHDOG_S = 10.0, 60.0
 _NOTIFY_S = 0.5
 _RETRY_S = 5.0
 _SWITCH_INTERVAL_S = 0.001
+_log = logging.getLogger(__name__)
 
 
 def add_commands(commands: Commands, home: Path) -> None:
@@ -55,9 +59,11 @@ def _run(options: argparse.Namespace) -> int:
             options.trace.mkdir(parents=True, exist_ok=True)
         robot_types.update(store)
         metrics = None if options.metrics is None else _serve_metrics(options.metrics)
-        while (code := _run_until_unpaired(store, options.trace, metrics)) is None:
+        traces = _export_traces(os.environ)
+        while (code := _run_until_unpaired(store, options.trace, metrics, traces)) is None:
             _pair(store, qr=not options.no_qr)
             robot_types.update(store)
+        traces.close()
     return code
 
 
@@ -104,11 +110,25 @@ def _serve_metrics(port: int) -> "AgentMetrics":
         raise ConfigError(f"--metrics {port}: {error.strerror}; choose a free port") from error
 
 
-def _run_until_unpaired(store: IdentityStore, trace: Path | None, metrics: "AgentMetrics | None") -> int | None:
+def _export_traces(environment: Mapping[str, str]) -> CommandTraces:
+    """The traces of this agent; none without a receiver or without the packages."""
+    if not any(environment.get(f"OTEL_EXPORTER_OTLP_{name}") for name in ("ENDPOINT", "TRACES_ENDPOINT")):
+        return NoTraces()
+    try:
+        from device_agent.transports.tracing import OtlpTraces  # noqa: PLC0415 (optional)
+    except ModuleNotFoundError as error:
+        _log.warning("no traces: install telescope-agent[tracing]; the Python package %s is missing", error.name)
+        return NoTraces()
+    return OtlpTraces()
+
+
+def _run_until_unpaired(
+    store: IdentityStore, trace: Path | None, metrics: "AgentMetrics | None", traces: CommandTraces
+) -> int | None:
     """Run with the saved pairing. Returns the exit code, or ``None`` if the pairing is no longer valid."""
     stop = threading.Event()
     previous = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    agent = bootstrap.build(store, trace=trace, metrics=metrics)
+    agent = bootstrap.build(store, trace=trace, metrics=metrics, traces=traces)
     try:
         if renderer := bootstrap.renderer_name(AgentConfig.load(store.folder)):
             print(f"renderer {renderer}", flush=True)

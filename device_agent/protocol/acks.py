@@ -7,9 +7,9 @@ import hashlib
 from enum import StrEnum
 from typing import Annotated, Any
 
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
-from device_agent.protocol.fields import Count, Id, Label, Milliseconds, Text
+from device_agent.protocol.fields import Count, Id, Label, Milliseconds, Text, TraceParent
 
 
 class AckStatus(StrEnum):
@@ -44,7 +44,10 @@ class Reason(Struct, frozen=True, kw_only=True):
 
 
 class Ack(Struct, frozen=True, kw_only=True):
-    """``ack``: the device's response to one command. ``sequence`` orders the acknowledgements of one command."""
+    """``ack``: the device's response to one command. ``sequence`` orders the acknowledgements of one command.
+
+    ``traceparent``: the device's span, if the command is traced.
+    """
 
     id: Id
     status: AckStatus
@@ -55,6 +58,7 @@ class Ack(Struct, frozen=True, kw_only=True):
     progress: float | None = None
     output: Text = ""
     result: dict[str, Any] = {}
+    traceparent: TraceParent | UnsetType = UNSET
 
 
 MessageId = Annotated[str, Meta(pattern="^[0-9a-f]{24}$", description="BLAKE2b of topic + line feed + payload")]

@@ -6,9 +6,19 @@ that an older agent must not ignore needs a new kind.
 
 from typing import Annotated, Any, get_args
 
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
-from device_agent.protocol.fields import Count, Id, JointPositions, Label, Milliseconds, Quaternion, Text, Vector3
+from device_agent.protocol.fields import (
+    Count,
+    Id,
+    JointPositions,
+    Label,
+    Milliseconds,
+    Quaternion,
+    Text,
+    TraceParent,
+    Vector3,
+)
 from device_agent.protocol.security.key_rotation import MAX_STATEMENTS, Statement
 
 LANGUAGE_PATTERN = r"([A-Za-z]{1,8}(-[A-Za-z0-9]{1,8})*)?"
@@ -255,7 +265,7 @@ class Command(Struct, frozen=True, kw_only=True):
 
     ``space``, ``agent`` and ``device`` bind it to one device, ``epoch`` binds it to one lease. It runs at most once per
     ``id`` and never after ``issued_at_ms + ttl_ms`` on the cloud's clock; the agent tracks the offset of that clock to
-    its own monotonic clock.
+    its own monotonic clock. ``traceparent`` names the span that sent it, if the request is traced.
     """
 
     id: Id
@@ -267,6 +277,7 @@ class Command(Struct, frozen=True, kw_only=True):
     caller: Label
     epoch: Count
     request: Request
+    traceparent: TraceParent | UnsetType = UNSET
 
 
 class JointTarget(_Request, frozen=True, kw_only=True, tag="joints"):

@@ -3,7 +3,7 @@
 import re
 from typing import Annotated
 
-from msgspec import Meta
+from msgspec import Meta, UnsetType
 
 from device_agent.protocol.topics import ID_PATTERN
 
@@ -18,6 +18,10 @@ UNPRINTABLE = (
 Label = Annotated[
     str, Meta(max_length=200, pattern=f"^[^{UNPRINTABLE}]*$", description="no control and format characters")
 ]
+TraceParent = Annotated[
+    str, Meta(description="the header `traceparent` of W3C Trace Context; receivers ignore an invalid one")
+]
+_TRACEPARENT = re.compile(r"00-(?!0{32})([0-9a-f]{32})-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
 _UNPRINTABLE = re.compile(f"[{UNPRINTABLE}]")
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Milliseconds = Annotated[int, Meta(ge=0, le=2**53)]
@@ -42,3 +46,9 @@ JointPositions = Annotated[
 def printable(text: str) -> str:
     """The text with each control or format character replaced by U+FFFD, as a label requires."""
     return _UNPRINTABLE.sub("\ufffd", text)
+
+
+def trace_id(traceparent: str | UnsetType) -> str:
+    """The trace id in a ``traceparent``: 32 hexadecimal digits; empty for an invalid or missing one."""
+    match = _TRACEPARENT.fullmatch(traceparent) if traceparent else None
+    return "" if match is None else match[1]

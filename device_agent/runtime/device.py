@@ -19,6 +19,7 @@ from device_agent.ports.sandbox import Sandbox
 from device_agent.ports.skills import Skills
 from device_agent.ports.speech import Speech
 from device_agent.ports.threads import SupervisedThread
+from device_agent.ports.tracing import CommandTraces, NoTraces
 from device_agent.ports.uploads import Uploads
 from device_agent.protocol import JointTelemetry, Measurements, Setpoint, Stop, StopLatch, codec, topics
 from device_agent.protocol.errors import ProtocolError, SignatureError
@@ -87,6 +88,7 @@ class Device:
         uploads: Uploads | None = None,
         load: LoadGovernor | None = None,
         supervisor: Supervisor | None = None,
+        traces: CommandTraces | None = None,
         streaming: bool = True,
     ) -> None:
         self.name = name
@@ -94,6 +96,7 @@ class Device:
         self._driver = driver
         self._sandbox = sandbox
         supervisor = supervisor or Supervisor()
+        traces = traces or NoTraces()
         supervisor.add(self)
         self._part_faults = PartFaults(supervisor)
         self._readings = readings
@@ -147,6 +150,7 @@ class Device:
             journal=journal,
             publish=publish,
             outbox=outbox,
+            traces=traces,
         )
         self._camera_streamer = CameraStreamer(
             robot_type.cameras,
@@ -181,6 +185,7 @@ class Device:
             part_faults=self._part_faults.present,
             device_faults=self._loop.faults,
             load=self._load,
+            traces=traces,
         )
 
     def _create_loop(self, driver: Driver | RoomDevice, robot_type: RobotType) -> ControlLoop | SensorLoop:

@@ -28,7 +28,7 @@ _MAX_RECENT = 20
 _MAX_MESSAGE = 2_000
 
 context: ContextVar[Callable[[], Mapping[str, str]] | None] = ContextVar("log context", default=None)
-"""Returns ``request``, ``action`` and ``device`` of the present work; called only if a line is written."""
+"""Returns ``request``, ``action``, ``device`` and ``trace_id`` of the work; called only if a line is written."""
 
 
 def add_arguments(parser: argparse.ArgumentParser, environment: Mapping[str, str]) -> None:

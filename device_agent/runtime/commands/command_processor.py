@@ -13,6 +13,7 @@ from functools import partial
 
 from device_agent.ports.clock import CloudClock, wall_ms
 from device_agent.ports.threads import Recovery, SupervisedThread
+from device_agent.ports.tracing import CommandTraces
 from device_agent.protocol import (
     AckStatus,
     CancelAction,
@@ -34,7 +35,7 @@ from device_agent.protocol import (
 )
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.events import EventKind
-from device_agent.protocol.fields import printable
+from device_agent.protocol.fields import printable, trace_id
 from device_agent.protocol.security import log_output, signing
 from device_agent.runtime.actions.executor import ActionExecutor
 from device_agent.runtime.authority.control_request import PendingControlRequest
@@ -80,6 +81,7 @@ class CommandProcessor:
         keys: PinnedKeys,
         wake: Callable[[], None],
         load: LoadGovernor,
+        traces: CommandTraces,
         device_faults: Callable[[], tuple[Fault, ...]] = tuple,
         part_faults: Callable[[], tuple[Fault, ...]] = tuple,
     ) -> None:
@@ -94,6 +96,7 @@ class CommandProcessor:
         self._keys = keys
         self._wake = wake
         self._load = load
+        self._traces = traces
         self._device_faults = device_faults
         self._part_faults = part_faults
         self._control_request = PendingControlRequest()
@@ -199,15 +202,17 @@ class CommandProcessor:
         except ProtocolError as error:
             self._record_rejection("malformed", str(error)[:300])
             return
-        log_output.context.set(lambda: {"device": self._name, "action": command.id})
+        trace = trace_id(command.traceparent)
+        log_output.context.set(lambda: {"device": self._name, "action": command.id, "trace_id": trace})
         if (command.space, command.agent, command.device) != self._address:
             self._record_rejection("wrong_address", "it is addressed to another device", command)
             return
-        first = self._publisher.create_ack(command.id, AckStatus.RECEIVED)
+        first = self._publisher.create_ack(command.id, AckStatus.RECEIVED, traceparent=command.traceparent)
         previous = self._journal.begin(self._name, first, issued_ms=command.issued_at_ms, epoch=command.epoch)
         if previous is not None:
             self._publisher.send_ack(previous)
             return
+        self._traces.begin(command)
         try:
             self._check_time(command)
             self._journal_epoch(command.epoch)

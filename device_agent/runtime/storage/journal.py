@@ -191,6 +191,7 @@ class Journal:
                     at_ms=now_ms,
                     tick_ms=tick_ms,
                     reason=reason,
+                    traceparent=last.traceparent,
                 )
             )
         return len(rows)

@@ -7,9 +7,11 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.sandbox import SandboxStatus
+from device_agent.ports.tracing import CommandTraces, NoTraces
 from device_agent.protocol import (
     Ack,
     AckStatus,
@@ -23,6 +25,7 @@ from device_agent.protocol import (
     Measurements,
     Mode,
     OpenRequest,
+    Reason,
     Restriction,
     State,
     StopLatch,
@@ -100,6 +103,7 @@ class DevicePublisher:
         journal: Journal,
         publish: Publish,
         outbox: Outbox,
+        traces: CommandTraces | None = None,
     ) -> None:
         self._address = address
         self._name = address[2]
@@ -114,6 +118,7 @@ class DevicePublisher:
         self._journal = journal
         self._publish = publish
         self._outbox = outbox
+        self._traces = traces or NoTraces()
         self._unrecorded: deque[Ack] = deque()
         self._delivered: queue.SimpleQueue[Ack] = queue.SimpleQueue()
         self._ack_sent = threading.Event()
@@ -130,7 +135,7 @@ class DevicePublisher:
 
     # ------------------------------------------------------------ acks
 
-    def create_ack(self, command: str, status: AckStatus, **fields: object) -> Ack:
+    def create_ack(self, command: str, status: AckStatus, *, reason: Reason | None = None, **fields: object) -> Ack:
         """Create the next ack of a command; it is neither journalled nor sent yet."""
         with self._lock:
             sequence = self._sequences.get(command, 0) + 1
@@ -138,9 +143,18 @@ class DevicePublisher:
                 self._sequences.pop(command, None)
             else:
                 self._sequences[command] = sequence
-        return Ack(id=command, status=status, sequence=sequence, at_ms=wall_ms(), tick_ms=tick_ms(), **fields)  # type: ignore[arg-type]
+        fields = {"traceparent": self._traces.step(command, status, reason), **fields}
+        return Ack(
+            id=command,
+            status=status,
+            sequence=sequence,
+            at_ms=wall_ms(),
+            tick_ms=tick_ms(),
+            reason=reason,
+            **fields,  # type: ignore[arg-type]
+        )
 
-    def report(self, command: str, status: AckStatus, **fields: object) -> None:
+    def report(self, command: str, status: AckStatus, **fields: Any) -> None:
         """Journal and publish the next ack of a command.
 
         A terminal ack is also published if it cannot be journalled: ``update_journal`` journals it later.
@@ -156,6 +170,8 @@ class DevicePublisher:
                 raise
             self._unrecorded.append(ack)
         self.send_ack(ack)
+        if ack.status.terminal:
+            self._traces.end(command)
 
     def send_ack(self, ack: Ack) -> None:
         """Publish an ack; ``repeat_acks`` repeats journalled acks until they are delivered."""

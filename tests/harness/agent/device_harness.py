@@ -15,6 +15,7 @@ from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.geometry import RobotGeometry
 from device_agent.ports.sandbox import Sandbox
 from device_agent.ports.speech import Speech
+from device_agent.ports.tracing import CommandTraces
 from device_agent.ports.uploads import Uploads
 from device_agent.protocol import (
     SHIPPED,
@@ -64,6 +65,7 @@ class DeviceHarness:
         speech: Speech | None = None,
         uploads: Uploads | None = None,
         supervisor: Supervisor | None = None,
+        traces: CommandTraces | None = None,
     ) -> None:
         self.load = LoadGovernor()
         self.key = signing.generate()
@@ -104,6 +106,7 @@ class DeviceHarness:
             uploads=uploads,
             load=self.load,
             supervisor=supervisor,
+            traces=traces,
         )
 
     def start(self) -> None:

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 from device_agent.cli.run import EXIT_FAILED
+from tests.harness.agent.pairing import paired_arm
 from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
 from tests.harness.network.brokers import PATIENCE_S, wait_until
 from tests.harness.paths import ROOT
-from tests.integration.agent.test_stop_outcomes import paired_arm
 
 MOVE = {"kind": "move_joints", "position_rad": {"shoulder_pan": 3.0}, "speed": 0.1}
 PROGRAM = """

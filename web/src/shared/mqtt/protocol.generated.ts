@@ -413,7 +413,11 @@ export interface Event {
   data?: Record<string, unknown>;
 }
 
-/** `ack`: the device's response to one command. `sequence` orders the acknowledgements of one command. */
+/**
+ * `ack`: the device's response to one command. `sequence` orders the acknowledgements of one command.
+ *
+ * `traceparent`: the device's span, if the command is traced.
+ */
 export interface Ack {
   /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
@@ -425,6 +429,8 @@ export interface Ack {
   progress?: number | null;
   output?: string;
   result?: Record<string, unknown>;
+  /** the header `traceparent` of W3C Trace Context; receivers ignore an invalid one */
+  traceparent?: string;
 }
 
 /** Progress of a command. The last four values are terminal. */
