@@ -4,6 +4,7 @@ Only the selected store and cloud adapters are imported. They import their SDKs 
 """
 
 import hashlib
+import logging
 import shutil
 import ssl
 from collections.abc import Awaitable, Callable
@@ -35,11 +36,13 @@ from function_app.ports.oidc_provider import OidcProvider
 from function_app.ports.password_hasher import PasswordHasher
 from function_app.ports.robot_catalogue import RobotCatalogue
 from function_app.ports.tables import StoreError, Tables
+from function_app.ports.tracing import NoTracing, Tracing
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, KeyVault, SecretsManager, Settings
 
 BLOBS_PATH = "/api/v1/blobs"
 """Path of presigned URLs of ``FileBlobs``."""
 MOSQUITTO_SERVICE = "service"
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,6 +64,7 @@ class Adapters:
     free_bytes: Callable[[], int | None] = lambda: None
     stored_bytes: Callable[[], dict[str, int]] = dict
     metrics: Metrics = field(default_factory=NoMetrics)
+    tracing: Tracing = field(default_factory=NoTracing)
 
 
 def adapters(settings: Settings, clock: Clock) -> Adapters:
@@ -96,6 +100,7 @@ def adapters(settings: Settings, clock: Clock) -> Adapters:
         if settings.store is None
         else dict,
         metrics=metrics(),
+        tracing=tracing(settings),
     )
 
 
@@ -106,6 +111,18 @@ def metrics() -> Metrics:
     except ModuleNotFoundError:
         return NoMetrics()
     return PrometheusMetrics()
+
+
+def tracing(settings: Settings) -> Tracing:
+    """The traces of this process; none without a receiver or without the packages, as on cloud hosts."""
+    if not settings.tracing:
+        return NoTracing()
+    try:
+        from function_app.adapters.local.monitoring.otlp_tracing import OtlpTracing  # noqa: PLC0415 (optional)
+    except ModuleNotFoundError as error:
+        _log.warning("no traces: install telescope-server[tracing]; the Python package %s is missing", error.name)
+        return NoTracing()
+    return OtlpTracing()
 
 
 def _least(*sizes: int | None) -> int | None:

@@ -51,6 +51,7 @@ class ActionServices(ControlServices):
             mailbox=self.mailbox,
             latencies=self.latencies,
             metrics=self.metrics,
+            tracing=self.tracing,
             clock=self.clock,
         )
 
@@ -67,6 +68,7 @@ class ActionServices(ControlServices):
             queues=self.queues,
             delivery=self.delivery,
             control_events=self.control_events,
+            tracing=self.tracing,
             clock=self.clock,
         )
 

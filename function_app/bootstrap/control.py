@@ -27,7 +27,9 @@ class ControlServices(MessagingServices):
 
     @cached_property
     def lease_store(self) -> LeaseStore:
-        return LeaseStore(tables=self.tables, control_events=self.control_events, clock=self.clock)
+        return LeaseStore(
+            tables=self.tables, control_events=self.control_events, tracing=self.tracing, clock=self.clock
+        )
 
     @cached_property
     def revocation(self) -> ControlRevocation:

@@ -31,11 +31,13 @@ class MessagingServices(HealthServices):
 
     @cached_property
     def delivery(self) -> Delivery:
-        return Delivery(bus=self.bus, mailbox=self.mailbox, relay=self.relay)
+        return Delivery(bus=self.bus, mailbox=self.mailbox, relay=self.relay, tracing=self.tracing)
 
     @cached_property
     def command_sender(self) -> CommandSender:
-        return CommandSender(delivery=self.delivery, keys=self.keys, metrics=self.metrics, clock=self.clock)
+        return CommandSender(
+            delivery=self.delivery, keys=self.keys, metrics=self.metrics, tracing=self.tracing, clock=self.clock
+        )
 
     @cached_property
     def xmpp_credentials(self) -> XmppCredentials:

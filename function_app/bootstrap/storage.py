@@ -1,5 +1,6 @@
 """The adapters as the ports that services take, and factories of the storage services."""
 
+import asyncio
 from functools import cached_property
 
 from function_app.adapters.factory import Adapters
@@ -29,11 +30,14 @@ class Ports:
         self.telemetry = adapters.telemetry
         self.late = adapters.late
         self.metrics = adapters.metrics
+        self.tracing = adapters.tracing
 
     async def close(self) -> None:
         """Close all connections."""
         for adapter in (self.bus, self.access, self.tables, self.blobs, self.keys, self.certificates):
             await adapter.close()
+        if self.tracing.enabled:
+            await asyncio.to_thread(self.tracing.close)
 
 
 class StorageServices(Ports):

@@ -17,6 +17,7 @@ from function_app.settings.access import (
     read_oidc,
     read_rate_limits,
     read_tls,
+    read_tracing,
 )
 from function_app.settings.broker import Broker, EventGridBus, EventGridWebhook, IotBus, Xmpp, read_broker, read_xmpp
 from function_app.settings.environment import Environment, SettingsError
@@ -81,6 +82,7 @@ class Settings:
         oidc: OpenID Connect provider.
         robots: Folder of the robot types.
         console: Folder of the built console.
+        tracing: Whether traces are exported. The exporter reads its standard variables (``OTEL_…``) itself.
         trusted_proxies: Number of own proxies in front of the API. They append the last addresses of
             ``X-Forwarded-For``.
         allow_unconfined_models: Check uploaded models even where their parser cannot be confined.
@@ -103,6 +105,7 @@ class Settings:
     oidc: OidcClient | None = None
     robots: Path = ROBOTS
     console: Path = CONSOLE
+    tracing: bool = False
     trusted_proxies: int = 0
     administration: Administration = field(default_factory=Administration)
     connections: ConnectionSettings = field(default_factory=ConnectionSettings)
@@ -146,6 +149,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         oidc=read_oidc(env),
         robots=env.folder("TELESCOPE_ROBOTS", ROBOTS),
         console=env.folder("TELESCOPE_CONSOLE", CONSOLE),
+        tracing=read_tracing(env),
         trusted_proxies=env.number("TELESCOPE_TRUSTED_PROXIES", 0, 0, 10),
         administration=read_administration(env),
         connections=read_connections(env),

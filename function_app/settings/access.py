@@ -160,3 +160,8 @@ def read_administration(env: Environment) -> Administration:
         raise SettingsError(f"{name} is invalid; it must be 16 to 255 characters without spaces")
     accounts = (fold_name(account) for account in env.get("TELESCOPE_ADMINISTRATORS").split(","))
     return Administration(accounts=frozenset(filter(None, accounts)), metrics_token=env.get(name))
+
+
+def read_tracing(env: Environment) -> bool:
+    """Whether a standard variable names a receiver of traces."""
+    return any(env.get(f"OTEL_EXPORTER_OTLP_{name}") for name in ("ENDPOINT", "TRACES_ENDPOINT"))

@@ -90,6 +90,7 @@ class Action:
         cancel_id: Id of the command that cancels it; empty: not cancelled.
         idempotency_key: Key of the row with its idempotency key, or empty.
         reissuable: Whether its command may be issued once more with a higher epoch: the request named no epoch.
+        traceparent: The request's span, for its command; empty: not traced.
     """
 
     id: str
@@ -118,6 +119,7 @@ class Action:
     queued_until_ms: int = 0
     turn_ms: int = 0
     reissuable: bool = False
+    traceparent: str = ""
 
     @property
     def issued_ms(self) -> int:

@@ -30,6 +30,7 @@ from function_app.entrypoints.http.devices import devices
 from function_app.entrypoints.http.framework.api_reference import reference
 from function_app.entrypoints.http.framework.authentication import COOKIE, RequestAuthenticator, is_stop
 from function_app.entrypoints.http.framework.client_address import client_address
+from function_app.entrypoints.http.framework.request_tracing import TRACE_ID, TracedRequests
 from function_app.entrypoints.http.framework.responses import JSON, problem
 from function_app.entrypoints.http.framework.route_index import RouteIndex
 from function_app.entrypoints.http.framework.routing import (
@@ -125,6 +126,8 @@ def create_app(functions: Functions) -> FastAPI:
         websocket_url=functions.settings.websocket_url,
         secure=_requires_hsts(functions.settings.public_url),
     )
+    if functions.tracing.enabled:
+        app.add_middleware(TracedRequests, tracing=functions.tracing)
     return app
 
 
@@ -305,4 +308,5 @@ def _log_context(scope: Scope, request_id: str) -> dict[str, str]:
         "request": request_id,
         "device": str(parameters.get("device", "")),
         "action": str(parameters.get("action", "")),
+        "trace_id": scope.get(TRACE_ID, ""),
     }

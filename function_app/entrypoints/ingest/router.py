@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from device_agent.protocol import Ack, codec, topics
 from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.fields import trace_id
 from device_agent.protocol.security import log_output
 from device_agent.protocol.topics import Topic
 from function_app.bootstrap import Functions
@@ -35,8 +36,11 @@ async def ingest(functions: Functions, topic: str, payload: bytes) -> None:
 
 
 def _log_context(topic: Topic, payload: bytes) -> dict[str, str]:
-    action = codec.decode(payload, Ack).id if topic.kind == topics.ACK else ""
-    return {"device": device_id(topic.agent, topic.device) if topic.device else "", "action": action}
+    device = device_id(topic.agent, topic.device) if topic.device else ""
+    if topic.kind != topics.ACK:
+        return {"device": device}
+    ack = codec.decode(payload, Ack)
+    return {"device": device, "action": ack.id, "trace_id": trace_id(ack.traceparent)}
 
 
 async def store_message(functions: Functions, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:

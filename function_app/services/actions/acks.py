@@ -2,10 +2,12 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Iterable
+from contextlib import nullcontext
 from typing import NamedTuple
 
 from device_agent.protocol import Ack, codec
 from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.fields import trace_id
 from device_agent.protocol.topics import Topic
 from function_app.domain.actions.action import AckReport, Action, Status, apply_report, mark_published, reached
 from function_app.domain.common.ids import device_id, split_command
@@ -13,6 +15,7 @@ from function_app.domain.common.json_depth import too_deep
 from function_app.domain.devices.devices import Transport
 from function_app.ports.clock import Clock
 from function_app.ports.metrics import Counter, Metrics
+from function_app.ports.tracing import Tracing
 from function_app.services.actions.action_store import ActionStore, StoredAction
 from function_app.services.actions.queue import ActionQueues
 from function_app.services.messaging.delivery import CONFIRMING
@@ -43,6 +46,7 @@ class ActionAcks:
         mailbox: Mailbox,
         latencies: LatencyStore,
         metrics: Metrics,
+        tracing: Tracing,
         clock: Clock,
     ) -> None:
         self._action_store = action_store
@@ -50,6 +54,7 @@ class ActionAcks:
         self._mailbox = mailbox
         self._latencies = latencies
         self._metrics = metrics
+        self._tracing = tracing
         self._clock = clock
 
     async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
@@ -65,16 +70,19 @@ class ActionAcks:
             raise ProtocolError(f"'{ack.id}' is not a command of {topic.agent}/{topic.device}")
         self._metrics.count(Counter.ACKS, ack.status)
         ack_report = report(ack, self._clock.now_ms())
-        if ack_report.device_epoch and await self._queues.reissue(ack.id, ack_report.device_epoch):
-            return
-        stored = await self._queues.change(ack.id, lambda action: apply_report(action, ack_report))
-        if stored is None:
-            await self._answer(topic.agent, ack)
-        elif ack.status.terminal and _measurable(stored.action):
-            await self._latencies.measured(stored.action, by)
-        if by != "mqtt":
-            # Last: after a failure the agent receives the command again and repeats the ack.
-            await self._mailbox.withdraw(topic.agent, ack.id)
+        # Not the others: a movement that prints reports several times per second.
+        traceparent = ack.traceparent if ack.status.terminal and trace_id(ack.traceparent) else None
+        with self._tracing.remote("store ack", traceparent, message=True) if traceparent else nullcontext():
+            if ack_report.device_epoch and await self._queues.reissue(ack.id, ack_report.device_epoch):
+                return
+            stored = await self._queues.change(ack.id, lambda action: apply_report(action, ack_report))
+            if stored is None:
+                await self._answer(topic.agent, ack)
+            elif ack.status.terminal and _measurable(stored.action):
+                await self._latencies.measured(stored.action, by)
+            if by != "mqtt":
+                # Last: after a failure the agent receives the command again and repeats the ack.
+                await self._mailbox.withdraw(topic.agent, ack.id)
 
     async def _answer(self, agent: str, ack: Ack) -> None:
         """Store the ack of a command that is not an action: its sender may wait for it."""
@@ -100,10 +108,13 @@ class ActionAcks:
         if acks is None:
             if published:
                 stored = await self._write(stored, (), published, stored.action)
-            return await self._poll(stored, target, end)
+            with self._tracing.span("await acks"):
+                return await self._poll(stored, target, end)
         reports: list[AckReport] = []
-        stored, action = await self._receive(stored, acks, target, end, reports)
-        return (await self._write(stored, reports, published, action)).action
+        with self._tracing.span("await acks"):
+            stored, action = await self._receive(stored, acks, target, end, reports)
+        with self._tracing.span("store acks"):
+            return (await self._write(stored, reports, published, action)).action
 
     async def _receive(
         self, stored: StoredAction, acks: AsyncIterator[Ack], target: Status, end: float, reports: list[AckReport]

@@ -20,6 +20,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
+from function_app.ports.tracing import Tracing
 from function_app.services.actions import capability_check
 from function_app.services.actions.acks import ActionAcks, Publication
 from function_app.services.actions.action_store import ActionStore, StoredAction, new_row
@@ -68,6 +69,7 @@ class StartAction:
         queues: ActionQueues,
         delivery: Delivery,
         control_events: ControlEvents,
+        tracing: Tracing,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -80,6 +82,7 @@ class StartAction:
         self._queues = queues
         self._delivery = delivery
         self._control_events = control_events
+        self._tracing = tracing
         self._clock = clock
 
     async def start(
@@ -113,7 +116,8 @@ class StartAction:
         async with AsyncExitStack() as stack:
             try:
                 async with gate or nullcontext():
-                    device, link = await self._devices.get_with_link(caller, device_id)
+                    with self._tracing.span("check access"):
+                        device, link = await self._devices.get_with_link(caller, device_id)
                     async with self._control_events.recording_rejections(device, caller, "start an action"):
                         key = _key(caller, device, idempotency_key)
                         stored, acks, published = await self._begin(caller, device, link, request, key, stack)
@@ -144,7 +148,8 @@ class StartAction:
             detail = f"The device's agent does not support the request '{kind}'. Update the agent."
             raise Problem("unable", 422, "The device cannot do this", detail)
         # Validated before any write: a command that cannot be sent must not occupy the slot.
-        command = self._command_sender.validated(device, action_id, task, caller=caller.name)
+        traceparent = self._tracing.current()
+        command = self._command_sender.validated(device, action_id, task, caller=caller.name, traceparent=traceparent)
         draft = Action(
             id=action_id,
             device=device.id,
@@ -161,11 +166,13 @@ class StartAction:
             session=caller.session,
             timeout_ms=request.timeout_ms,
             reissuable=request.epoch is None,
+            traceparent=traceparent,
         )
-        await self._reminders.schedule(action_id, now_ms + RETRY_MS)
-        if request.policy == "queue":
-            await self._queues.schedule_check(device.id)
-        stored, created = await self._write(caller, device, draft, request)
+        with self._tracing.span("write action, slot and lease"):
+            await self._reminders.schedule(action_id, now_ms + RETRY_MS)
+            if request.policy == "queue":
+                await self._queues.schedule_check(device.id)
+            stored, created = await self._write(caller, device, draft, request)
         action = stored.action
         if created and action.status is Status.QUEUED:
             await self._queues.advance(device.id)

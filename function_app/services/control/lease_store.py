@@ -7,6 +7,7 @@ from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
+from function_app.ports.tracing import Tracing
 from function_app.services.control.control_events import ControlEvents, lease_change
 from function_app.services.devices.control_rows import apply_device_epochs, read_control
 from function_app.services.storage import records
@@ -15,9 +16,10 @@ from function_app.services.storage import records
 class LeaseStore:
     """Changes leases. An action that gets its own lease writes it in its own batch."""
 
-    def __init__(self, *, tables: Tables, control_events: ControlEvents, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, control_events: ControlEvents, tracing: Tracing, clock: Clock) -> None:
         self._tables = tables
         self._control_events = control_events
+        self._tracing = tracing
         self._clock = clock
 
     async def change(
@@ -45,7 +47,8 @@ class LeaseStore:
             await self._tables.batch(records.CONTROL, [control.write_lease(device.id, lease), *facts])
             return control.lease, lease
 
-        before, after = await records.retry(attempt)
-        if watched:
-            await self._control_events.publish(device.id)
+        with self._tracing.span("write lease"):
+            before, after = await records.retry(attempt)
+            if watched:
+                await self._control_events.publish(device.id)
         return before, after

@@ -2,6 +2,7 @@
 
 import logging
 
+from msgspec import UNSET
 from msgspec.structs import replace
 
 from device_agent.protocol import CancelAction, Command, Request, RunMovement, StopDevice, codec
@@ -16,6 +17,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.metrics import Counter, Metrics
 from function_app.ports.signing_keys import SigningKeys
+from function_app.ports.tracing import Tracing
 from function_app.services.messaging.delivery import Confirmation, Delivery, SignedCommand
 
 SHORT_TTL_MS = 5_000
@@ -31,19 +33,22 @@ _log = logging.getLogger(__name__)
 class CommandSender:
     """Builds, signs and sends commands."""
 
-    def __init__(self, *, delivery: Delivery, keys: SigningKeys, metrics: Metrics, clock: Clock) -> None:
+    def __init__(
+        self, *, delivery: Delivery, keys: SigningKeys, metrics: Metrics, tracing: Tracing, clock: Clock
+    ) -> None:
         self._delivery = delivery
         self._keys = keys
         self._metrics = metrics
+        self._tracing = tracing
         self._clock = clock
 
-    def validated(self, device: Device, id_: str, request: Request, *, caller: str) -> Command:
+    def validated(self, device: Device, id_: str, request: Request, *, caller: str, traceparent: str) -> Command:
         """A command without epoch and times, which the device can decode.
 
         Raises:
             Problem: ``invalid``: a field is out of range, a number is not finite, or the message is too long.
         """
-        command = _command(device, id_, request, caller=caller, ttl_ms=1)
+        command = _command(device, id_, request, caller=caller, ttl_ms=1, traceparent=traceparent)
         try:
             codec.decode(codec.encode(command, limit=codec.MAX_BYTES - _ENVELOPE_BYTES), Command)
         except ProtocolError as error:
@@ -87,6 +92,7 @@ class CommandSender:
             epoch=action.epoch,
             issued_ms=action.issued_ms,
             ttl_ms=action.ttl_ms,
+            traceparent=action.traceparent,
         )
         signed = await self.sign(command)
         await self._delivery.send(device, signed._replace(expires_ms=until_ms or signed.expires_ms))
@@ -153,12 +159,29 @@ class CommandSender:
         now_ms = self._clock.now_ms()
         id_ = command or command_id(device.id, now_ms)
         return await self.sign(
-            _command(device, id_, request, caller=caller, epoch=epoch, issued_ms=now_ms, ttl_ms=SHORT_TTL_MS)
+            _command(
+                device,
+                id_,
+                request,
+                caller=caller,
+                epoch=epoch,
+                issued_ms=now_ms,
+                ttl_ms=SHORT_TTL_MS,
+                traceparent=self._tracing.current(),
+            )
         )
 
 
 def _command(
-    device: Device, id_: str, request: Request, *, caller: str, ttl_ms: int, epoch: int = 0, issued_ms: int = 0
+    device: Device,
+    id_: str,
+    request: Request,
+    *,
+    caller: str,
+    ttl_ms: int,
+    epoch: int = 0,
+    issued_ms: int = 0,
+    traceparent: str = "",
 ) -> Command:
     return Command(
         id=id_,
@@ -170,4 +193,5 @@ def _command(
         caller=printable(caller),
         epoch=epoch,
         request=request,
+        traceparent=traceparent or UNSET,
     )

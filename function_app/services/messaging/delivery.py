@@ -16,6 +16,7 @@ from typing import NamedTuple
 from device_agent.protocol import Ack, AckStatus, topics
 from function_app.domain.devices.devices import Device
 from function_app.ports.command_bus import CommandBus
+from function_app.ports.tracing import Tracing
 from function_app.services.messaging.broker_relay import BrokerRelay
 from function_app.services.messaging.mailbox import Answer, Mailbox
 
@@ -48,7 +49,8 @@ class SignedCommand(NamedTuple):
 class Delivery:
     """Sends commands and awaits their acks."""
 
-    def __init__(self, *, bus: CommandBus, mailbox: Mailbox, relay: BrokerRelay) -> None:
+    def __init__(self, *, bus: CommandBus, mailbox: Mailbox, relay: BrokerRelay, tracing: Tracing) -> None:
+        self._tracing = tracing
         self._bus = bus
         self._relay = relay
         self._mailbox = mailbox
@@ -60,19 +62,20 @@ class Delivery:
             BusUnavailable: The broker did not confirm it.
         """
         topic = f"{device.topic}/{topics.CMD}"
-        if device.transport == "mqtt":
-            await self._bus.publish(topic, signed.payload)
-            return
-        await self._mailbox.put(
-            device,
-            signed.command,
-            topic=topic,
-            payload=signed.payload,
-            expires_ms=signed.expires_ms,
-            first=signed.first,
-        )
-        if device.transport == "xmpp":
-            await self._relay_message(topic, signed.payload)
+        with self._tracing.span("publish command"):
+            if device.transport == "mqtt":
+                await self._bus.publish(topic, signed.payload)
+                return
+            await self._mailbox.put(
+                device,
+                signed.command,
+                topic=topic,
+                payload=signed.payload,
+                expires_ms=signed.expires_ms,
+                first=signed.first,
+            )
+            if device.transport == "xmpp":
+                await self._relay_message(topic, signed.payload)
 
     async def stop(self, device: Device, author: str, payload: bytes) -> None:
         """Publish the plain Stop message of the account ``author``.
@@ -113,8 +116,9 @@ class Delivery:
                 await self._mailbox.expect_ack(device, signed.command, expires_ms=signed.expires_ms)
             await self.send(device, signed)
             try:
-                async with asyncio.timeout(wait_ms / 1000):
-                    status, epoch = await self._first_ack(device, signed.command, acks)
+                with self._tracing.span("await acks"):
+                    async with asyncio.timeout(wait_ms / 1000):
+                        status, epoch = await self._first_ack(device, signed.command, acks)
             except TimeoutError:
                 return Confirmation()
             return Confirmation(status in CONFIRMING, epoch)

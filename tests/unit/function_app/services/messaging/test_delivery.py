@@ -7,6 +7,7 @@ from typing import Any
 from function_app.adapters.local.clock import SystemClock
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Role
+from function_app.ports.tracing import NoTracing
 from function_app.services.messaging.delivery import Delivery, SignedCommand
 from function_app.services.messaging.mailbox import Mailbox
 from function_app.services.storage.retention import Retention
@@ -32,7 +33,7 @@ async def confirmed(wait_ms: int) -> bool:
     retention = Retention(tables=tables, blobs=MemoryBlobs(now_s=time.time))
     mailbox = BusyMailbox(tables=tables, retention=retention, clock=clock)
     unused: Any = None  # the agent polls
-    delivery = Delivery(bus=unused, mailbox=mailbox, relay=unused)
+    delivery = Delivery(bus=unused, mailbox=mailbox, relay=unused, tracing=NoTracing())
     signed = SignedCommand("aaaaaaaaaa-arm-00000000000000000000", b"{}", clock.now_ms() + 5_000)
     async with asyncio.timeout(20):
         return (await delivery.send_confirmed(ARM, signed, wait_ms=wait_ms)).confirmed
