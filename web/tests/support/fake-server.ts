@@ -13,6 +13,7 @@ interface Call {
 export interface Answer {
   status: number;
   body?: unknown;
+  headers?: Record<string, string>;
 }
 
 export const ok = (body: unknown): Answer => ({ status: 200, body });
@@ -42,8 +43,8 @@ export class FakeServer {
       };
       this.calls.push(call);
       const handler = this.#handlers.get(call.route);
-      const { status, body } = handler === undefined ? problem(404, "not-found", `No response for ${call.route}.`) : await handler(call);
-      return new Response(body === undefined ? null : JSON.stringify(body), { status });
+      const { status, body, headers } = handler === undefined ? problem(404, "not-found", `No response for ${call.route}.`) : await handler(call);
+      return new Response(body === undefined ? null : JSON.stringify(body), { status, ...(headers && { headers }) });
     });
   }
 

@@ -1,5 +1,6 @@
 /** HTTP API calls with an HttpOnly session cookie. All failures are `ApiError`. */
 import { updateServerTime, now } from "../lib/clock";
+import { newId } from "../lib/ids";
 
 export interface Page<T> {
   items: T[];
@@ -24,6 +25,8 @@ export class ApiError extends Error {
 
 /** Timeout of one call, in addition to the server-side wait [ms]. */
 const TIMEOUT_MS = 10_000;
+/** Status of an error whose cause is only in the server's log. */
+const UNEXPECTED = 500;
 
 interface CallOptions {
   body?: unknown;
@@ -66,7 +69,7 @@ export class Http {
 
   async call<T>(method: string, path: string, options: CallOptions = {}): Promise<T> {
     const headers: Record<string, string> = { Accept: "application/json", ...options.headers };
-    if (method !== "GET") headers["X-CSRF-Token"] = this.#csrf;
+    if (method !== "GET") Object.assign(headers, { "X-CSRF-Token": this.#csrf }, newTrace());
     if (options.body !== undefined) headers["Content-Type"] = "application/json";
     const sentAt = now();
     let response: Response;
@@ -89,7 +92,7 @@ export class Http {
     if (serverMs !== null) updateServerTime(Number(serverMs), sentAt, now());
     const body = parseBody(text, response.status);
     if (response.ok) return body as T;
-    const rejection = problem(response.status, body);
+    const rejection = problem(response.status, body, response.headers.get("X-Request-Id"));
     // After a new sign-in in another tab the cookie has changed, so use the new session's token.
     if (rejection.code !== "csrf-token" || options.retried === true) throw rejection;
     const { csrf_token: csrf } = await this.call<{ csrf_token: string | null }>("GET", "/accounts/me");
@@ -107,12 +110,19 @@ function parseBody(text: string, status: number): unknown {
   }
 }
 
-function problem(status: number, body: unknown): ApiError {
+/** Headers that begin a trace (W3C Trace Context, sampled). The request id in the server's log is the trace id. */
+function newTrace(): Record<string, string> {
+  const trace = newId();
+  return { "X-Request-Id": trace, traceparent: `00-${trace}-${newId().slice(0, 16)}-01` };
+}
+
+function problem(status: number, body: unknown, request: string | null): ApiError {
   const fields = (typeof body === "object" && body !== null ? body : {}) as Record<string, unknown>;
   const detail = [fields["detail"], fields["title"]].find((text) => typeof text === "string" && text !== "");
   const type = typeof fields["type"] === "string" ? fields["type"] : "";
   const message = typeof detail === "string" ? detail : `The server responded with status ${status}.`;
-  return new ApiError(status, type.split("/").pop() ?? "", message, fields);
+  const reference = status === UNEXPECTED && request !== null ? ` Request ID: ${request}` : "";
+  return new ApiError(status, type.split("/").pop() ?? "", message + reference, fields);
 }
 
 /** An error as a sentence for display. */
