@@ -76,7 +76,7 @@ def test_a_dead_control_loop_halts_the_driver_and_is_reported(setup: Setup) -> N
     assert state.mode is Mode.FAULT
     assert [fault.code for fault in state.faults] == ["agent.control-loop"]
     assert "InjectedCrash" in state.faults[0].message
-    (event,) = setup.harness.events(EventKind.PART_FAILED)
+    (event,) = eventually(lambda: setup.harness.events(EventKind.PART_FAILED))
     assert event.data == {"part": "control loop"}
     assert setup.harness.end(setup.action).status is AckStatus.FAILED
     setup.stop_unconfirmed()
