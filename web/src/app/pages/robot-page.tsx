@@ -73,7 +73,8 @@ function Operate({ api, fleet, device, account }: OperateProps) {
   const [session] = useDeviceSessions(api, fleet, [device], account);
   if (session === undefined) return null;
   const { control, stop } = session;
-  const robot = device.description.value?.joints.length !== 0;
+  const description = device.description.value;
+  const robot = description?.joints.length !== 0;
   const access = <DeviceAccess api={api} fleet={fleet} device={device} account={account} />;
   return (
     <>
@@ -83,7 +84,7 @@ function Operate({ api, fleet, device, account }: OperateProps) {
         <StopBanner device={device} stop={stop} />
         <RateNotice device={device} />
         <PageExplainer page={robot ? "device" : "roomDevice"} />
-        {robot && <RunStatusPanel device={device} control={control} actions={session.actions} />}
+        {(robot || description.behaviours.length > 0) && <RunStatusPanel device={device} control={control} actions={session.actions} />}
         {robot ? (
           <RobotColumns api={api} fleet={fleet} session={session} account={account} access={access} />
         ) : (

@@ -1,4 +1,5 @@
-/** The page of a room device: one card for each capability in its description. */
+/** The page of a device without joints: one card for each capability in its description. */
+import { ActionCards } from "../../features/actions";
 import { EventLog } from "../../features/devices";
 import type { DeviceSession } from "../../features/control/model";
 import type { Fleet } from "../../features/devices/model";
@@ -63,6 +64,7 @@ export function RoomDevicePage({ api, fleet, session, access }: RoomDevicePagePr
       </div>
       <div class="column">
         {hasCamera && settings}
+        <ActionCards fleet={fleet} session={session} />
         {description.actions.includes("gather") && <CollectDataCard device={device} roomAction={roomAction} />}
         {description.captures.length > 0 && <CapturesCard device={device} roomAction={roomAction} />}
         <EventLog device={device} />
