@@ -220,6 +220,7 @@ const ack = object<Required<Ack>>({
   progress: nullable(number),
   output: optional(text, ""),
   result: optional(record, {}),
+  traceparent: optional(text, ""),
 });
 
 const decoder = new TextDecoder("utf-8", { fatal: true });
