@@ -21,7 +21,7 @@ BROWSERS = -n 2 --dist loadscope tests/e2e
 # These tests measure a moving robot or need a response within a deadline, so they run one at a time.
 SERIAL = tests/api tests/faults tests/security/tenants/test_secrets.py
 
-.PHONY: docs help up link env console test test-fast test-long bench bench-quick coverage fuzz check check-python check-web audit-packages contract requirements \
+.PHONY: docs help up link env console test test-fast test-long bench bench-quick coverage fuzz mutation check check-python check-web audit-packages contract requirements \
 	system-packages test-environment wheels clean
 .DELETE_ON_ERROR:
 
@@ -36,6 +36,7 @@ help:
 	@echo "make bench           run all benchmarks, including one hour of load; writes benchmarks/results and docs/results"
 	@echo "make bench-quick     run all benchmarks with fewer samples, in about ten minutes"
 	@echo "make fuzz            run each parser under a fuzzer for SECONDS_EACH (60) seconds"
+	@echo "make mutation        test mutants of authority, control, actions and delivery; writes docs/results/mutation.md"
 	@echo "make wheels          build the distributions telescope-agent and telescope-server into dist/"
 	@echo "make contract        regenerate the AsyncAPI document, the script API and the console's message types"
 	@echo "make requirements    regenerate requirements.txt and requirements/*.txt"
@@ -69,6 +70,11 @@ env: .venv/.local
 .venv/.bench: requirements/bench.txt | .venv/.dev
 	@echo "telescope: installing Python packages for benchmarks" >&2
 	@$(PIP) -r requirements/bench.txt
+	@touch $@
+
+.venv/.mutation: requirements/mutation.txt | .venv/.dev
+	@echo "telescope: installing Python packages for mutation testing" >&2
+	@$(PIP) -r requirements/mutation.txt
 	@touch $@
 
 .venv/.docs: requirements/docs.txt | .venv/.local
@@ -147,6 +153,9 @@ bench bench-quick: .venv/.dev .venv/.bench console
 	@tests/system-packages
 	@$(BIN)/python -m benchmarks $(if $(findstring quick,$@),--quick)
 
+mutation: .venv/.mutation
+	@nice -n 15 $(BIN)/python -m tests.harness.mutation --page
+
 fuzz: .venv/.dev
 	@$(BIN)/python -m tests.security.fuzz $(SECONDS_EACH)
 
@@ -185,4 +194,4 @@ requirements: .venv/.dev
 	@$(BIN)/python requirements/export.py
 
 clean:
-	rm -rf .venv dist site web/node_modules web/dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv dist site mutants web/node_modules web/dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

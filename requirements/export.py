@@ -20,9 +20,14 @@ EXPORTS = {
     "requirements/docs.txt": ("docs",),
     "requirements/dev.txt": ("dev",),
     "requirements/azure-worker.txt": ("azure-worker",),
+    "requirements/mutation.txt": ("mutation",),
 }
-OPTIONS = {"requirements/azure-worker.txt": ("--no-deps", "--python-version", "3.13")}
-"""Extra options of ``uv pip compile``. The Functions worker runs beside packages that are installed already."""
+OPTIONS = {
+    "requirements/azure-worker.txt": ("--no-deps", "--python-version", "3.13"),
+    "requirements/mutation.txt": ("--constraint", "requirements/dev.txt"),
+}
+"""Extra options of ``uv pip compile``. The Functions worker runs beside packages that are installed already. Packages
+for mutation testing are installed beside those of ``dev``."""
 EXCLUDED = "sys_platform == 'never'"
 """Marker with which ``pyproject.toml`` leaves out a package that another one requests and does not need."""
 HEADER = "# Exported from pyproject.toml by `make requirements`: groups {}.\n"

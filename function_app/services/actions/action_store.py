@@ -1,6 +1,6 @@
 """Stores actions. Ending an action also frees its slot, lease and place in the queue."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from function_app.domain.actions.action import Action, Status
@@ -57,7 +57,7 @@ class ActionStore:
         row = await self._tables.get(records.CONTROL, *where)
         return None if row is None else StoredAction(records.read(row, Action), row)
 
-    async def list(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Action], str | None]:
+    async def list(self, device: Device, *, cursor: str | None, limit: int) -> tuple[Sequence[Action], str | None]:
         """Actions of a device since its pairing, newest first. Raises ``cursor-invalid``."""
         page = await records.page(
             self._tables, records.CONTROL, device.id, first=_PREFIX, last=_END, limit=limit, cursor=cursor

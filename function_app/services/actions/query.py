@@ -1,5 +1,6 @@
 """Reads, awaits and cancels actions."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -44,7 +45,7 @@ class Actions:
 
     async def list(
         self, caller: Identity, device: str, *, cursor: str | None, limit: int
-    ) -> tuple[list[Action], str | None]:
+    ) -> tuple[Sequence[Action], str | None]:
         """A device's actions, newest first. Raises ``device-unknown`` or ``cursor-invalid``."""
         return await self._action_store.list(await self._devices.get(caller, device), cursor=cursor, limit=limit)
 

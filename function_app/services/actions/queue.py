@@ -6,7 +6,7 @@ start when a person releases control.
 """
 
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import Final
 
 from function_app.domain.actions.action import RETRY_MS, Action, Status, end, give_turn, may_reissue, reissue
@@ -163,7 +163,7 @@ class ActionQueues:
         await records.retry(attempt)
         await self.advance(device)
 
-    async def positions(self, actions: list[Action]) -> dict[str, int]:
+    async def positions(self, actions: Sequence[Action]) -> dict[str, int]:
         """Queue positions of the queued actions of one device; 1 is next."""
         waiting = [action for action in actions if action.status is Status.QUEUED]
         if not waiting:

@@ -185,6 +185,22 @@ def test_stop_needs_no_lease_and_survives_a_restart(harness: DeviceHarness, make
     again.done(move(0.1), epoch=4)
 
 
+def test_a_stop_ends_the_lease_and_its_latch_survives_a_restart(
+    harness: DeviceHarness, make_device: MakeDevice
+) -> None:
+    harness.done(grant(), epoch=4)
+    harness.done(StopDevice(reason="smoke"))
+    stored = harness.journal.device("arm")
+    assert (stored.burned, stored.latch is not None) == (4, True), "on disk before the Stop is acknowledged"
+    assert harness.failed(grant(), epoch=4).code == "lease_ended"
+    state = wait_for_state(harness, lambda state: state.stop)
+    assert (state.lease, state.ended_epoch) == (None, 4)
+    latch = wait_for_state(make_device(), lambda state: state.stop).stop
+    assert latch is not None
+    assert latch == stored.latch
+    assert (latch.caller, latch.reason, latch.verified) == ("ann", "smoke", True)
+
+
 def test_a_late_stop_is_applied_and_a_replayed_or_late_reset_does_not_release_it(harness: DeviceHarness) -> None:
     harness.done(StopDevice(reason="late"), issued_at_ms=1)
     await_mode(harness, Mode.STOPPED)

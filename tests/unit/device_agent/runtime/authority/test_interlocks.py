@@ -117,6 +117,7 @@ def test_an_interlock_without_a_reading_holds() -> None:
     assert fixture.step() == [(NAME, 0.0, "no measurement of pir/presence has arrived")]
     assert fixture.step(1.0) == [], "once"
     assert [happened.kind for happened in fixture.recorded] == [EventKind.INTERLOCK_ENGAGED]
+    assert "held" in fixture.recorded[0].message
 
 
 def test_presence_and_silence_slow_and_absence_clears() -> None:
@@ -135,6 +136,9 @@ def test_presence_and_silence_slow_and_absence_clears() -> None:
     kinds = [happened.kind for happened in fixture.recorded]
     assert kinds == [EventKind.INTERLOCK_ENGAGED, EventKind.INTERLOCK_CLEARED] * 2
     assert fixture.recorded[0].data == {"interlock": NAME, "action": "slow", "reason": "present = true"}
+    assert fixture.recorded[0].severity == "warning"
+    assert "slowed" in fixture.recorded[0].message
+    assert (fixture.recorded[1].severity, fixture.recorded[1].data) == ("info", {"interlock": NAME})
 
 
 def test_rules_act_independently() -> None:

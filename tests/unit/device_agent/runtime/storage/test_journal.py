@@ -181,3 +181,55 @@ def test_a_failed_sync_raises(journal: Journal, monkeypatch: pytest.MonkeyPatch)
     journal.close()
     with pytest.raises(JournalError, match="could not be synced"):
         journal.sync()
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda journal: journal.save_epoch("arm", epoch=1, burned=1),
+        lambda journal: journal.save_latch("arm", StopLatch(caller="ann", reason="", at_ms=1)),
+        lambda journal: journal.save_movement("arm", "a", "test", "dance", 1),
+        lambda journal: journal.next_session(),
+        lambda journal: journal.record(ack("c1", AckStatus.DONE, 2)),
+    ],
+    ids=["epoch", "latch", "movement", "session", "terminal ack"],
+)
+def test_a_promise_is_on_disk_when_its_call_returns(journal: Journal, write: Callable[[Journal], object]) -> None:
+    journal.begin("arm", ack("c1"))
+    statements: list[str] = []
+    assert journal._database is not None
+    journal._database.set_trace_callback(statements.append)
+    write(journal)
+    first, write_statement, last = (each for each in statements if not each.startswith(("BEGIN", "COMMIT")))
+    assert (first, last) == ("PRAGMA synchronous=FULL", "PRAGMA synchronous=NORMAL")
+    assert write_statement.startswith(("INSERT", "UPDATE"))
+
+
+def test_an_intermediate_ack_is_not_synced(journal: Journal) -> None:
+    journal.begin("arm", ack("c1"))
+    statements: list[str] = []
+    assert journal._database is not None
+    journal._database.set_trace_callback(statements.append)
+    journal.record(ack("c1", AckStatus.STARTED, 2))
+    assert not [each for each in statements if each.startswith("PRAGMA")]
+
+
+def test_movement_versions_never_decrease_and_belong_to_device_author_type_and_name(journal: Journal) -> None:
+    place = ("arm", "a", "test", "dance")
+    assert journal.movement(*place) == 0
+    for version, stored in ((3, 3), (2, 3), (4, 4)):
+        journal.save_movement(*place, version)
+        assert journal.movement(*place) == stored
+    assert journal.movement("other", "a", "test", "dance") == 0
+    assert journal.movement("arm", "other", "test", "dance") == 0
+    assert journal.movement("arm", "a", "other", "dance") == 0
+    assert journal.movement("arm", "a", "test", "other") == 0
+
+
+def test_an_ended_command_of_a_previous_run_has_its_time_and_is_undelivered(open_journal: OpenJournal) -> None:
+    open_journal().begin("arm", ack("c1"))
+    after = open_journal()
+    assert after.end_open(now_ms=7, tick_ms=8) == 1
+    (ended,) = after.undelivered("arm").values()
+    assert (ended.id, ended.status, ended.sequence, ended.at_ms, ended.tick_ms) == ("c1", AckStatus.FAILED, 2, 7, 8)
+    assert after.end_open(now_ms=9, tick_ms=9) == 0

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -19,10 +20,13 @@ from function_app.domain.actions.action import (
     Status,
     apply_report,
     end,
+    give_turn,
     mark_published,
+    may_reissue,
     next_check_ms,
     next_step,
     reached,
+    reissue,
     withdraw,
 )
 
@@ -252,3 +256,87 @@ def test_the_earliest_reception_of_an_ack_counts() -> None:
     action = applied(NEW, [later, early])
     assert action.received == {"received": 30}
     assert apply_report(action, last) is action
+
+
+QUEUED = replace(NEW, status=Status.QUEUED, epoch=0, timeout_ms=60_000, queued_until_ms=1_500_000, times={"queued": 1})
+
+
+def test_a_turn_starts_time_to_live_and_time_limit() -> None:
+    turn = give_turn(QUEUED, 4, 1_200_000)
+    assert turn == replace(
+        QUEUED,
+        status=Status.CREATED,
+        epoch=4,
+        turn_ms=1_200_000,
+        deadline_ms=1_260_000,
+        times={"queued": 1, "created": 1_200_000},
+    )
+    assert (QUEUED.issued_ms, turn.issued_ms, turn.expires_ms) == (1_000_000, 1_200_000, 1_210_000)
+
+
+@pytest.mark.parametrize(("after_ms", "step"), [(-1, NextStep.WAIT), (0, NextStep.EXPIRE)])
+def test_a_queued_action_waits_until_its_time_ends(after_ms: int, step: NextStep) -> None:
+    assert next_step(QUEUED, QUEUED.queued_until_ms + after_ms) is step
+    assert next_check_ms(QUEUED, 5) == QUEUED.queued_until_ms
+    assert apply_report(QUEUED, AckReport(Status.DONE, 1, 1)) is QUEUED, "it was never sent"
+
+
+def test_an_ended_action_has_no_next_step() -> None:
+    assert next_step(replace(NEW, status=Status.DONE), 0) is NextStep.ENDED
+
+
+@pytest.mark.parametrize(
+    ("changes", "device_epoch", "may"),
+    [
+        ({}, 1, True),
+        ({}, 9, True),
+        ({}, 0, False),
+        ({"reissuable": False}, 9, False),
+        ({"epoch": 0}, 9, False),
+        ({"epoch": 0}, 0, False),
+        ({"status": Status.UNKNOWN}, 9, False),
+        ({"status": Status.FAILED}, 9, False),
+    ],
+)
+def test_a_command_is_reissued_only_while_it_is_open_and_rejected(
+    changes: dict[str, Any], device_epoch: int, may: bool
+) -> None:
+    assert may_reissue(replace(NEW, **({"reissuable": True} | changes)), device_epoch) is may
+
+
+def test_a_reissued_command_starts_again_and_only_once() -> None:
+    rejected = replace(
+        applied(mark_published(NEW, 1_000_001), [AckReport(Status.RECEIVED, 3, 5, received_ms=7)]),
+        reissuable=True,
+        timeout_ms=60_000,
+    )
+    issued = reissue(rejected, 9, 1_002_000)
+    assert (issued.times, issued.received, issued.sequence) == ({"created": 1_002_000}, {}, -1)
+    assert (issued.epoch, issued.turn_ms, issued.deadline_ms) == (9, 1_002_000, 1_062_000)
+    assert (issued.status, issued.reissuable) == (Status.CREATED, False)
+    for epoch in (1, 8):
+        assert apply_report(issued, AckReport(Status.FAILED, 4, 6, device_epoch=epoch)) is issued
+    for epoch in (0, 9):
+        assert apply_report(issued, AckReport(Status.FAILED, 4, 6, device_epoch=epoch)).status is Status.FAILED
+
+
+@pytest.mark.parametrize(
+    ("at_ms", "ended_ms"), [(1_030_000, 1_030_000), (5, NEW.created_ms), (9_999_999, NEW.deadline_ms)]
+)
+def test_the_end_is_limited_to_plausible_times(at_ms: int, ended_ms: int) -> None:
+    assert apply_report(NEW, AckReport(Status.DONE, 1, at_ms)).ended_ms == ended_ms
+
+
+def test_an_older_report_replaces_no_content_and_an_empty_one_keeps_it() -> None:
+    reports = [
+        AckReport(
+            Status.STARTED, 2, 5, progress=0.5, output="new", result={"a": 1}, reason={"code": "c", "message": "m"}
+        ),
+        AckReport(Status.STARTED, 3, 6),
+    ]
+    action = applied(NEW, reports)
+    kept = (0.5, "new", {"a": 1}, {"code": "c", "message": "m"})
+    assert (action.progress, action.output, action.result, action.reason) == kept
+    older = replace(NEW, status=Status.RECEIVED, sequence=5, output="new")
+    late = apply_report(older, AckReport(Status.STARTED, 2, 5, progress=0.1, output="old", result={"b": 2}))
+    assert (late.status, late.sequence, late.output, late.progress, late.result) == (Status.STARTED, 5, "new", None, {})

@@ -190,6 +190,14 @@ def test_deep_parameters_are_run_or_refused(anna: Person, robot: Robot, depth: i
 
 
 class TestIdempotencyKey:
+    def test_a_repeated_request_returns_the_action_although_the_device_is_offline_now(
+        self, anna: Person, robot: Robot
+    ) -> None:
+        first = anna.start(robot.device, idempotency_key="k1").json()["id"]
+        robot.publish_presence(online=False)
+        assert anna.start(robot.device, idempotency_key="k1").json()["id"] == first
+        problem(anna.start(robot.device, idempotency_key="k2"), 409, "device-offline")
+
     def test_the_same_request_is_published_once(self, anna: Person, robot: Robot) -> None:
         options = {"json": {"request": MOVE, "wait_ms": 10_000}, "headers": {"Idempotency-Key": "k1"}}
         calls = [anna.begin("POST", f"/devices/{robot.device}/actions", **options) for _ in range(10)]

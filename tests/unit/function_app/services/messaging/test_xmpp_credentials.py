@@ -1,0 +1,151 @@
+"""XMPP passwords: purpose, lifetime, contacts, and who is refused (see also tests/integration/xmpp)."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from function_app.domain.common.problems import Problem
+from function_app.domain.devices.devices import Agent
+from function_app.domain.identity.accounts import Identity
+from function_app.services.identity.authenticator import SESSION_S
+from function_app.services.messaging.xmpp_credentials import AGENT_S, LOGIN_S, Contact, Password, XmppCredentials
+from function_app.services.storage import records
+from function_app.settings.broker import Xmpp
+from tests.fakes.agent import Robot
+from tests.fixtures.cloud import OpenCloud
+from tests.harness.cloud.cloud import Cloud, Person, paired
+
+CLOUD_CONTACT = Contact("cloud", "Telescope")
+
+
+@pytest.fixture
+def cloud(open_cloud: OpenCloud) -> Cloud:
+    """The functions with an XMPP server."""
+    cloud = open_cloud(xmpp=Xmpp(domain="example.org"))
+    cloud.start_ingest()
+    return cloud
+
+
+@pytest.fixture
+def credentials(cloud: Cloud) -> XmppCredentials:
+    return cloud.functions.xmpp_credentials
+
+
+def stored(robot: Robot) -> Agent:
+    row = robot.cloud.run(robot.cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
+    assert row is not None
+    return records.read(row, Agent)
+
+
+def store(cloud: Cloud, agent: Agent) -> None:
+    row = cloud.run(cloud.functions.tables.get(records.AGENTS, agent.id, "agent"))
+    assert row is not None
+    cloud.run(cloud.functions.tables.replace(records.AGENTS, row.changed(records.to_data(agent))))
+
+
+def identity(person: Person) -> Identity:
+    return Identity(person.account, person.name, person.session)
+
+
+def passwords(cloud: Cloud, anna: Person, robot: Robot) -> dict[str, Password]:
+    credentials = cloud.functions.xmpp_credentials
+    return {
+        "agent": cloud.run(credentials.agent(stored(robot))),
+        "account": cloud.run(credentials.account(identity(anna))),
+        "cloud": cloud.run(credentials.cloud()),
+    }
+
+
+def test_an_agent_is_admitted_with_the_cloud_and_its_owner(
+    cloud: Cloud, credentials: XmppCredentials, anna: Person, robot: Robot
+) -> None:
+    issued = passwords(cloud, anna, robot)["agent"]
+    now_s = cloud.clock.now_ms() // 1000
+    assert (issued.user, issued.lifetime_s) == (robot.id, AGENT_S)
+    assert issued.expires_ms in {(now_s + AGENT_S) * 1000, (now_s - 1 + AGENT_S) * 1000}
+    cloud.clock.advance(600)
+    admitted = cloud.run(credentials.verify(robot.id, issued.password))
+    assert (admitted.user, admitted.name, admitted.kind) == (robot.id, stored(robot).name, "agent")
+    assert admitted.contacts == (CLOUD_CONTACT, Contact(anna.account, "anna"))
+    assert AGENT_S - 602 <= admitted.lifetime_s <= AGENT_S - 600
+
+
+def test_an_account_is_admitted_with_its_xmpp_agents(
+    cloud: Cloud, credentials: XmppCredentials, anna: Person, robot: Robot
+) -> None:
+    with paired(cloud, "anna"), paired(cloud, "bert") as (_, foreign):
+        for each in (robot, foreign):
+            store(cloud, replace(stored(each), transport="xmpp"))
+        issued = passwords(cloud, anna, robot)["account"]
+        assert (issued.user, issued.lifetime_s) == (anna.account, SESSION_S)
+        assert 0 < issued.expires_ms - cloud.clock.now_ms() <= SESSION_S * 1000
+        admitted = cloud.run(credentials.verify(anna.account, issued.password))
+        assert (admitted.user, admitted.name, admitted.kind) == (anna.account, "anna", "account")
+        assert admitted.contacts == (CLOUD_CONTACT, Contact(robot.id, stored(robot).name))
+        assert admitted.lifetime_s == LOGIN_S
+
+
+def test_the_gateway_is_admitted_without_contacts(
+    cloud: Cloud, credentials: XmppCredentials, anna: Person, robot: Robot
+) -> None:
+    issued = passwords(cloud, anna, robot)["cloud"]
+    assert (issued.user, issued.lifetime_s) == ("cloud", AGENT_S)
+    admitted = cloud.run(credentials.verify("cloud", issued.password))
+    assert (admitted.user, admitted.name, admitted.kind, admitted.contacts) == ("cloud", "Telescope", "cloud", ())
+    assert AGENT_S - 2 <= admitted.lifetime_s <= AGENT_S
+
+
+@pytest.mark.parametrize(
+    ("user", "kind"),
+    [
+        (user, kind)
+        for user in ("agent", "account", "cloud")
+        for kind in ("agent", "account", "cloud", "access token", "no token")
+        if user != kind
+    ],
+)
+def test_a_password_admits_only_its_user(cloud: Cloud, anna: Person, robot: Robot, user: str, kind: str) -> None:
+    issued = passwords(cloud, anna, robot)
+    texts = {name: each.password for name, each in issued.items()} | {"access token": anna.token, "no token": "x"}
+    with pytest.raises(Problem) as problem:
+        cloud.run(cloud.functions.xmpp_credentials.verify(issued[user].user, texts[kind]))
+    assert (problem.value.code, problem.value.status) == ("unauthorized", 401)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda agent: replace(agent, account=None), lambda agent: replace(agent, pairing="another")],
+    ids=["released", "paired again"],
+)
+def test_a_password_ends_with_the_pairing(
+    cloud: Cloud, credentials: XmppCredentials, anna: Person, robot: Robot, change: Callable[[Agent], Agent]
+) -> None:
+    issued = passwords(cloud, anna, robot)["agent"]
+    store(cloud, change(stored(robot)))
+    with pytest.raises(Problem, match="wrong"):
+        cloud.run(credentials.verify(robot.id, issued.password))
+
+
+def test_passwords_expire(cloud: Cloud, credentials: XmppCredentials, anna: Person, robot: Robot) -> None:
+    issued = passwords(cloud, anna, robot)
+    cloud.clock.advance(AGENT_S + 1)
+    for user in ("agent", "cloud"):
+        with pytest.raises(Problem, match="wrong"):
+            cloud.run(credentials.verify(issued[user].user, issued[user].password))
+
+
+def test_without_a_server_nothing_is_issued_or_verified(open_cloud: OpenCloud) -> None:
+    cloud = open_cloud()
+    credentials = cloud.functions.xmpp_credentials
+    anna = cloud.sign_in("anna")
+    for call in (credentials.cloud(), credentials.account(identity(anna)), credentials.verify("cloud", "x")):
+        with pytest.raises(Problem) as problem:
+            cloud.run(call)
+        assert (problem.value.code, problem.value.status) == ("xmpp-unavailable", 409)
+
+
+def test_an_unclaimed_agent_gets_no_password(cloud: Cloud, credentials: XmppCredentials, robot: Robot) -> None:
+    with pytest.raises(Problem) as problem:
+        cloud.run(credentials.agent(replace(stored(robot), space=None)))
+    assert problem.value.code == "agent-unclaimed"
