@@ -40,6 +40,8 @@ _MAX_INCOMING = 5000
 _SAVE_RETRY_S = 5.0
 _PERIOD_S = 0.25
 _DRAIN_S = 0.5
+_STOP_S = 3.0
+"""``stop`` waits at most this long for a hanging disk [s]."""
 _RESPONSE_S = 60.0
 """An outbox without progress for this time hangs [s]; opening a large file on a slow disk takes long."""
 _log = logging.getLogger(__name__)
@@ -126,7 +128,7 @@ class Outbox:
         """Store the rest, and send the last messages if the link is up. May be called twice."""
         self._stopping.set()
         self._wake.set()
-        self._thread.join(timeout=3)
+        self._thread.join(timeout=_STOP_S)
 
     @property
     def stored_bytes(self) -> int:

@@ -1,6 +1,7 @@
 """Mutants of the safety-critical packages, made and tested by mutmut in the folder ``mutants``.
 
-mutmut does not remove statements and mutates every string. Here statements are removed, and texts for people stay.
+mutmut does not remove statements and mutates every string. Here statements are removed, and texts for people and
+log lines stay.
 """
 
 import gc
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import libcst
+from libcst import matchers
 from mutmut import __main__ as mutmut
 from mutmut.configuration import config
 from mutmut.mutation.data import SourceFileMutationData
@@ -38,6 +40,7 @@ PACKAGES: Final = {
 }
 """Package → files to mutate."""
 FOLDER: Final = ROOT / "mutants"
+_LOG_CALL: Final = matchers.Call(func=matchers.Attribute(value=matchers.Name("_log")))
 
 
 def generate() -> dict[str, list[str]]:
@@ -121,7 +124,8 @@ def _code_strings(node: libcst.BaseString) -> Iterable[libcst.BaseString]:
 
 
 def _without_call(node: libcst.Expr) -> Iterable[libcst.Pass]:
-    if isinstance(node.value, libcst.Call | libcst.Await):
+    """Removes a call, unless it writes a log line."""
+    if isinstance(node.value, libcst.Call | libcst.Await) and not matchers.matches(node.value, _LOG_CALL):
         yield libcst.Pass()
 
 

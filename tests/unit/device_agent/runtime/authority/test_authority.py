@@ -83,7 +83,10 @@ def test_a_stop_is_latched_and_recorded() -> None:
     assert fixture.authority.latch == LATCH
     assert fixture.authority.changed.is_set()
     event = fixture.event(EventKind.STOP_LATCHED)
-    assert (event.severity, event.data) == ("warning", {"caller": "bob", "reason": "smoke", "verified": False})
+    assert (event.severity, event.data) == (
+        "warning",
+        {"stop": "", "caller": "bob", "reason": "smoke", "verified": False},
+    )
     with pytest.raises(Refused, match="bob") as refused:
         fixture.authority.check_free()
     assert refused.value.code == "stopped"
@@ -104,7 +107,7 @@ def test_only_a_verified_stop_replaces_an_unverified_one(first: bool, second: bo
     assert latch is not None
     assert (latch.caller, latch.at_ms) == (shown, 5)
     verified = [event.data for event in fixture.events if event.kind is EventKind.STOP_VERIFIED]
-    replaced = {"caller": "cat", "reason": "fire", "verified": True}
+    replaced = {"stop": "", "caller": "cat", "reason": "fire", "verified": True}
     assert verified == ([replaced] if shown == "cat" else [])
 
 

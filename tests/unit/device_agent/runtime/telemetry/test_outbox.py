@@ -14,7 +14,7 @@ from device_agent.protocol.events import EventKind
 from device_agent.runtime.storage.outbox_store import OutboxStore, OutboxStoreError
 from device_agent.runtime.telemetry import outbox as module
 from device_agent.runtime.telemetry.outbox import BUSY_RATE_HZ, RATE_HZ, Outbox
-from tests.harness.agent.device_harness import eventually
+from tests.harness.agent.device_harness import WITHIN_S, eventually
 
 ARM = "ts/v1/s/a/arm"
 LATE = ARM + "/late/joints"
@@ -367,3 +367,20 @@ def test_the_thread_sends_at_once_and_drains_before_it_stops(fixture: OutboxFixt
     fixture.event("last")
     fixture.iterate()
     assert fixture.stored() == ["last"]
+
+
+def test_a_hanging_disk_does_not_delay_the_stop(fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_STOP_S", 0.01)
+    hangs, released = threading.Event(), threading.Event()
+
+    def hang() -> None:
+        hangs.set()
+        released.wait()
+
+    monkeypatch.setattr(fixture.store, "open", hang)
+    fixture.outbox.start()
+    assert hangs.wait(WITHIN_S)
+    fixture.outbox.stop()
+    assert fixture.outbox._thread.is_alive()
+    released.set()
+    fixture.outbox._thread.join(WITHIN_S)

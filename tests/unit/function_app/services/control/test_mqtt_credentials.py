@@ -118,3 +118,12 @@ def test_an_account_without_devices_may_view_nothing(cloud: Cloud, broker: Memor
 @pytest.mark.parametrize("body", [{}, {"purpose": "root"}, {"purpose": "control"}, {"purpose": "view", "device": "x"}])
 def test_invalid_purposes_are_refused(cloud: Cloud, body: dict[str, str]) -> None:
     problem(cloud.sign_in("anna").post("/mqtt/credentials", body), 422, "invalid")
+
+
+def test_a_shared_device_may_be_viewed_and_stopped_without_its_space(anna: Person, bert: Person, robot: Robot) -> None:
+    share = {"account": "bert", "role": "operator"}
+    assert anna.post(f"/devices/{robot.device}/shares", share).status_code in {200, 201}
+    issued = bert.post("/mqtt/credentials", {"purpose": "view"}).json()
+    base = f"ts/v1/{robot.space}/{robot.id}/arm"
+    assert issued["publish"] == [f"{base}/stop/{bert.account}"]
+    assert {f"{base}/{kind}" for kind in VIEWED} <= set(issued["subscribe"])

@@ -113,6 +113,14 @@ def test_a_password_admits_only_its_user(cloud: Cloud, anna: Person, robot: Robo
     assert (problem.value.code, problem.value.status) == ("unauthorized", 401)
 
 
+def test_a_password_admits_no_other_account(
+    cloud: Cloud, credentials: XmppCredentials, anna: Person, robot: Robot
+) -> None:
+    bert = cloud.sign_in("bert")
+    with pytest.raises(Problem, match="wrong"):
+        cloud.run(credentials.verify(bert.account, passwords(cloud, anna, robot)["account"].password))
+
+
 @pytest.mark.parametrize(
     "change",
     [lambda agent: replace(agent, account=None), lambda agent: replace(agent, pairing="another")],
