@@ -195,7 +195,7 @@ def test_a_failed_sync_raises(journal: Journal, monkeypatch: pytest.MonkeyPatch)
     ids=["epoch", "latch", "movement", "session", "terminal ack"],
 )
 def test_a_promise_is_on_disk_when_its_call_returns(journal: Journal, write: Callable[[Journal], object]) -> None:
-    journal.begin("arm", ack("c1"))
+    journal.begin("arm", ack("c1"), issued_ms=1)
     statements: list[str] = []
     assert journal._database is not None
     journal._database.set_trace_callback(statements.append)
@@ -206,7 +206,7 @@ def test_a_promise_is_on_disk_when_its_call_returns(journal: Journal, write: Cal
 
 
 def test_an_intermediate_ack_is_not_synced(journal: Journal) -> None:
-    journal.begin("arm", ack("c1"))
+    journal.begin("arm", ack("c1"), issued_ms=1)
     statements: list[str] = []
     assert journal._database is not None
     journal._database.set_trace_callback(statements.append)
@@ -227,7 +227,7 @@ def test_movement_versions_never_decrease_and_belong_to_device_author_type_and_n
 
 
 def test_an_ended_command_of_a_previous_run_has_its_time_and_is_undelivered(open_journal: OpenJournal) -> None:
-    open_journal().begin("arm", ack("c1"))
+    open_journal().begin("arm", ack("c1"), issued_ms=1)
     after = open_journal()
     assert after.end_open(now_ms=7, tick_ms=8) == 1
     (ended,) = after.undelivered("arm").values()

@@ -77,7 +77,7 @@ def test_each_transport_gets_commands_and_stops_in_its_own_way(
     tables, clock, relay, bus = MemoryTables(), SystemClock(), Relay(), Bus()
     retention = Retention(tables=tables, blobs=MemoryBlobs(now_s=time.time))
     mailbox = Mailbox(tables=tables, retention=retention, clock=clock)
-    delivery = Delivery(bus=cast("Any", bus), mailbox=mailbox, relay=cast("Any", relay))
+    delivery = Delivery(bus=cast("Any", bus), mailbox=mailbox, relay=cast("Any", relay), tracing=NoTracing())
     device = replace(ARM, transport=transport)
     signed = SignedCommand("aaaaaaaaaa-arm-00000000000000000000", b"{}", clock.now_ms() + 5_000)
 
