@@ -21,7 +21,7 @@ BROWSERS = -n 2 --dist loadscope tests/e2e
 # These tests measure a moving robot or need a response within a deadline, so they run one at a time.
 SERIAL = tests/api tests/faults tests/security/tenants/test_secrets.py
 
-.PHONY: docs help up link env console test test-fast test-long bench bench-quick coverage fuzz mutation check check-python check-web audit-packages contract requirements \
+.PHONY: docs help up link env console test test-fast test-long bench bench-quick soak coverage fuzz mutation check check-python check-web audit-packages contract requirements \
 	system-packages test-environment wheels clean
 .DELETE_ON_ERROR:
 
@@ -35,6 +35,7 @@ help:
 	@echo "make coverage        unit tests of the agent; every branch of its runtime must be covered"
 	@echo "make bench           run all benchmarks, including one hour of load; writes benchmarks/results and docs/results"
 	@echo "make bench-quick     run all benchmarks with fewer samples, in about ten minutes"
+	@echo "make soak            run the simulated laboratory under load for SOAK_HOURS (8); checks memory, descriptors and errors"
 	@echo "make fuzz            run each parser under a fuzzer for SECONDS_EACH (60) seconds"
 	@echo "make mutation        test mutants of authority, control, actions and delivery; writes docs/results/mutation.md"
 	@echo "make wheels          build the distributions telescope-agent and telescope-server into dist/"
@@ -152,6 +153,12 @@ coverage: .venv/.dev
 bench bench-quick: .venv/.dev .venv/.bench console
 	@tests/system-packages
 	@$(BIN)/python -m benchmarks $(if $(findstring quick,$@),--quick)
+
+# Ctrl-C ends it with a report.
+soak: export SOAK_HOURS ?= 8
+soak: .venv/.dev .venv/.bench console
+	@tests/system-packages
+	@$(BIN)/python -m benchmarks soak
 
 mutation: .venv/.mutation
 	@nice -n 15 $(BIN)/python -m tests.harness.mutation --page

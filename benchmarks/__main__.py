@@ -43,7 +43,7 @@ def run(name: str, *, quick: bool) -> Report:
         print(f"{name:10} {time.monotonic() - started_s:6.0f} s  {line}", flush=True)
 
     report: Report = suite.run(quick=quick, log=log)
-    save(report, QUICK if quick else RESULTS)
+    save(report, QUICK if report.quick else RESULTS)
     log(f"done, {sum(claim.holds for claim in report.claims)} of {len(report.claims)} claims hold")
     return report
 

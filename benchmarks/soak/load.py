@@ -1,4 +1,4 @@
-"""Load on the laboratory: clients that stream, start movements, stop robots, view telemetry and sign in."""
+"""Load on the laboratory: clients that stream, start movements, stop robots, view telemetry, sign in and share."""
 
 import contextlib
 import math
@@ -22,6 +22,12 @@ _STOPPED: Final = "hanson"
 """Robot that is stopped during every third movement and reset by a signed-in owner."""
 _STOP_EVERY: Final = 3
 _HISTORY_MS: Final = 60_000
+_SHARED: Final = "qbo"
+_GUEST: Final = "guest"
+_PAGE: Final = 50
+"""Rows per list: a response that grows with the stored data would look like a leak."""
+_LISTS: Final = ("actions", "events", "faults", "shares", "invitations", "movements")
+_ACCOUNT_LISTS: Final = ("/devices", "/agents", "/spaces", "/api-keys", "/accounts/me/sessions", "/accounts/me/audit")
 _PERIOD_S: Final = 0.05
 _SWING_RAD: Final = 0.15
 _SWING_S: Final = 4.0
@@ -54,6 +60,7 @@ class Load:
         clients: dict[str, Callable[[httpx.Client, int], None]] = {
             "operator": self._operate,
             "visitor": self._visit,
+            "owner": self._share,
             "watcher 1": self._watch,
             "watcher 2": self._watch,
         }
@@ -188,15 +195,18 @@ class Load:
     def _stop(self, http: httpx.Client, device: dict[str, Any], request: dict[str, Any]) -> None:
         """Stops a robot during a movement, waits for the end and resets the latch as a signed-in owner."""
         action = self._start(http, device, request, "started")
-        if not self._request(http, "POST", f"/devices/{device['id']}/stop", {"reason": "soak"})["confirmed"]:
-            raise RuntimeError("a Stop was not confirmed")
-        ended = self._request(http, "GET", f"/actions/{action['id']}", wait_ms=10_000)
-        if ended["status"] not in ("failed", "cancelled"):
-            raise RuntimeError(f"the stopped action ended as {ended['status']}")
-        with Api(self._product.machine) as api:
-            if not api.post(f"/devices/{device['id']}/stop/reset")["confirmed"]:
-                raise RuntimeError("a reset was not confirmed")
-            api.post("/auth/sign-out")
+        try:
+            if not self._request(http, "POST", f"/devices/{device['id']}/stop", {"reason": "soak"})["confirmed"]:
+                raise RuntimeError("a Stop was not confirmed")
+            ended = self._request(http, "GET", f"/actions/{action['id']}", wait_ms=10_000)
+            if ended["status"] not in ("failed", "cancelled"):
+                raise RuntimeError(f"the stopped action ended as {ended['status']}")
+        finally:
+            with Api(self._product.machine) as api:
+                reset = api.post(f"/devices/{device['id']}/stop/reset")["confirmed"]
+                api.post("/auth/sign-out")
+        if not reset:
+            raise RuntimeError("a reset was not confirmed")
         self.count("Stops and resets")
 
     # ------------------------------------------------------------ viewers and sign-ins
@@ -226,7 +236,27 @@ class Load:
             api.post("/auth/sign-out")
             self.count("HTTP requests", 9)
             self.count("sign-ins and sign-outs")
-        self._stopping.wait(self._hold_s / 4)
+        self._stopping.wait(self._hold_s / 2)
+
+    def _share(self, _http: httpx.Client, _number: int) -> None:
+        """Shares a robot with another account, which reads it; reads all lists; removes the share."""
+        with Api(self._product.machine) as owner, Api(self._product.machine, _GUEST) as guest:
+            device = owner.device(_SHARED)
+            path = f"/devices/{device['id']}"
+            account = owner.post(f"{path}/shares", {"account": _GUEST, "role": "operator"})["account"]["id"]
+            if [each["id"] for each in guest.get("/devices")["items"]] != [device["id"]]:
+                raise RuntimeError("the shared device is not in the list of the other account")
+            paths = [*(f"{path}/{name}" for name in _LISTS), *_ACCOUNT_LISTS]
+            for each in paths:
+                owner.get(each, limit=_PAGE)
+            removed = owner.http.delete(f"{path}/shares/{account}")
+            if removed.status_code != httpx.codes.NO_CONTENT or guest.get("/devices")["items"]:
+                raise RuntimeError(f"the share was not removed: {removed.status_code}")
+            owner.post("/auth/sign-out")
+            guest.post("/auth/sign-out")
+            self.count("HTTP requests", len(paths) + 9)
+            self.count("shares given and removed")
+        self._stopping.wait(self._hold_s)
 
 
 class StreamedArm:

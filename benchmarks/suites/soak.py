@@ -1,11 +1,16 @@
-"""One hour of load on the laboratory: memory, descriptors and errors."""
+"""Hours of load on the laboratory: memory, descriptors and errors."""
 
+import contextlib
 import os
+import re
+import signal
 import tempfile
+import threading
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final, cast
 
 from benchmarks.baseline.product import start
 from benchmarks.reporting.report import QUICK, Chart, Claim, Report, Table, load
@@ -13,24 +18,35 @@ from benchmarks.soak.load import Load
 from benchmarks.soak.processes import PARTS, TOTAL, ProcessWatcher, Sample
 from benchmarks.soak.trends import DescriptorTrend, after_warm_up, reduced_to_medians
 
-MINUTES: Final = "SOAK_MINUTES"
-"""Environment variable that sets the duration of the full run [min]."""
+if TYPE_CHECKING:
+    from tests.harness.network.brokers import BrokerKind
+
+HOURS: Final = "SOAK_HOURS"
+BROKER: Final = "SOAK_BROKER"
+"""Environment variables that set the duration of the full run [h] and the broker."""
 SERIES: Final = QUICK / "soak.csv"
 """File of all samples; it remains after a killed run."""
 _MAX_SLOPE: Final = 1.0
 _QUICK_S: Final = 48.0
+_FULL_S: Final = 3600.0
+"""Shortest run whose result is published."""
 _WARM_UP: Final = 1 / 3
-"""Warm-up share of the run, after which caches and pools are full (17 to 20 minutes of an hour)."""
-_ABOUT: Final = """The laboratory as `make up` starts it with amqtt: four robots and a room behind one agent. One
+_MAX_WARM_UP_S: Final = 1800.0
+"""Warm-up: this share of the run, at most this time; then caches and pools are full (17 to 20 minutes)."""
+_LOG_ERROR: Final = re.compile(r"^(?:[-0-9]+ [:,0-9]+ )?((?:ERROR|CRITICAL)\b.*|Traceback .*)", re.MULTILINE)
+_PRESSURE: Final = Path("/proc/pressure/cpu")
+_ABOUT: Final = """The laboratory as `make up` starts it with {broker}: four robots and a room behind one agent. One
 client streams setpoints to the arm and acquires, renews and releases leases, each time with new credentials. Movement
 scripts run on all robots; one robot is stopped during every third movement and reset. Two clients subscribe to all
-telemetry and reconnect with new credentials. One client signs in, reads resources and signs out. `SOAK_MINUTES=10
-python -m benchmarks soak` sets another duration; each sample is written to `benchmarks/results/quick/soak.csv`."""
-_NOTE: Final = """Theil-Sen slopes over medians of one minute, after a warm-up of one third of the run, with Sen's 95
-% interval; a plus sign means growth. Own memory is anonymous memory (heap and stack); resident memory includes shared
-libraries. First and last descriptors and threads are the lowest tenth of the first and the last tenth of the run
-after warm-up, because each running script has its own. The agent's children are its planner and script sandboxes;
-their number follows the load."""
+telemetry and reconnect with new credentials. One client signs in, reads resources and signs out. One client shares a
+robot with another account, reads all lists and removes the share. `make soak` runs for 8 hours; `SOAK_HOURS` and
+`SOAK_BROKER` set another duration and broker. Ctrl-C ends a run with its report. Results of less than an hour, and all
+samples, are in `benchmarks/results/quick`."""
+_NOTE: Final = """Theil-Sen slopes over medians of one minute, after a warm-up of one third of the run (at most half
+an hour), with Sen's 95 % interval; a plus sign means growth. Own memory is anonymous memory (heap and stack);
+resident memory includes shared libraries. First and last descriptors and threads are the lowest tenth of the first
+and the last tenth of the run after warm-up, because each running script has its own. The agent's children are its
+planner and script sandboxes; their number follows the load."""
 
 _HISTORY: Final = Table(
     title="Memory: effect of changes",
@@ -48,28 +64,58 @@ bytes each, which it keeps for the lifetime of a token, one hour.""",
 
 
 def run(*, quick: bool, log: Callable[[str], None]) -> Report:
-    """Runs the load for an hour, or for about a minute in a quick run, and evaluates it."""
-    for_s = _QUICK_S if quick else 60 * float(os.environ.get(MINUTES, "60"))
-    log(f"starting the laboratory, then {for_s / 60:.1f} min of load")
+    """Runs the load for the requested hours, or for about a minute in a quick run, and evaluates it."""
+    for_s = _QUICK_S if quick else 3600 * float(os.environ.get(HOURS, "1"))
+    broker = cast("BrokerKind", os.environ.get(BROKER, "amqtt"))
+    log(f"starting the laboratory with {broker}, then {for_s / 60:.1f} min of load")
     with (
+        ended_by_signal() as ended,
         tempfile.TemporaryDirectory() as folder,
-        start(Path(folder), "amqtt", TELESCOPE_ROOM="lab", TELESCOPE_TRACE="") as product,
-        ProcessWatcher(product.machine.process.pid, every_s=1.0 if quick else 5.0, file=SERIES) as watcher,
-        Load(product, hold_s=4.0 if quick else 20.0) as clients,
+        start(Path(folder), broker, TELESCOPE_ROOM="lab", TELESCOPE_TRACE="") as product,
     ):
-        started_s = time.monotonic()
-        logged_s = started_s
-        while (now_s := time.monotonic()) < started_s + for_s:
-            time.sleep(min(1.0, started_s + for_s - now_s))
-            if now_s > logged_s + 60:
-                logged_s = now_s
+        with (
+            ProcessWatcher(product.machine.process.pid, every_s=1.0 if quick else 5.0, file=SERIES) as watcher,
+            Load(product, hold_s=4.0 if quick else 20.0) as clients,
+        ):
+            started_s, waited_us = time.monotonic(), processor_pressure_us()
+            while (left_s := started_s + for_s - time.monotonic()) > 0 and not ended.wait(min(60.0, left_s)):
                 log(progress(watcher.samples, clients))
-    trends = after_warm_up(watcher.samples, for_s * _WARM_UP, end_share=1 / 3 if quick else 0.1)
-    report = Report(suite="soak", title="Soak", about=[_ABOUT], quick=quick)
-    report.tables = [_memory(trends, for_s), _descriptors(trends), _work(clients), _HISTORY]
-    report.charts = charts(watcher.samples, for_s * _WARM_UP)
-    report.claims = _quick_claims(trends, clients) if quick else claims(trends, clients, for_s)
+            for_s = time.monotonic() - started_s
+            waited = (processor_pressure_us() - waited_us) / 1e4 / for_s
+        errors = clients.errors + log_errors(Path(folder) / "logs")
+    warm_up_s = min(for_s * _WARM_UP, _MAX_WARM_UP_S)
+    trends = after_warm_up(watcher.samples, warm_up_s, end_share=1 / 3 if quick else 0.1)
+    report = Report(suite="soak", title="Soak", about=[_ABOUT.format(broker=broker)], quick=for_s < _FULL_S)
+    report.tables = [_memory(trends, for_s), _descriptors(trends), _work(clients.done, errors, waited), _HISTORY]
+    report.charts = charts(watcher.samples, warm_up_s)
+    report.claims = _quick_claims(trends, errors) if quick else claims(trends, clients.done, errors, for_s)
     return report
+
+
+@contextlib.contextmanager
+def ended_by_signal() -> Iterator[threading.Event]:
+    """Yields an event that SIGINT and SIGTERM set, so that an interrupted run also ends with its report."""
+    ended = threading.Event()
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    handlers = [signal.signal(number, lambda *_: ended.set()) for number in numbers]
+    try:
+        yield ended
+    finally:
+        for number, handler in zip(numbers, handlers, strict=True):
+            signal.signal(number, handler)
+
+
+def log_errors(folder: Path) -> Counter[str]:
+    """Counts the error lines and tracebacks in the logs of the programs, by program and text."""
+    found: Counter[str] = Counter()
+    for path in sorted(folder.glob("*.log*")):
+        found.update(f"{path.stem}: {line[:160]}" for line in _LOG_ERROR.findall(path.read_text(errors="replace")))
+    return found
+
+
+def processor_pressure_us() -> int:
+    """Returns the total time in which a task of this machine waited for a processor; 0 if Linux does not measure it."""
+    return int(_PRESSURE.read_text().splitlines()[0].rpartition("total=")[2]) if _PRESSURE.exists() else 0
 
 
 def progress(samples: list[Sample], clients: Load) -> str:
@@ -80,7 +126,7 @@ def progress(samples: list[Sample], clients: Load) -> str:
     return f"{usage}; {clients.done['HTTP requests']} requests, {clients.done['actions']} actions{errors}"
 
 
-def claims(trends: list[DescriptorTrend], clients: Load, for_s: float) -> list[Claim]:
+def claims(trends: list[DescriptorTrend], done: Counter[str], errors: Counter[str], for_s: float) -> list[Claim]:
     """Returns the targets of a full run."""
     (product,) = [each for each in trends if each.part == TOTAL]
     worst = max((each for each in trends if each is not product), key=lambda each: each.own.percent_per_h)
@@ -97,15 +143,15 @@ def claims(trends: list[DescriptorTrend], clients: Load, for_s: float) -> list[C
             "descriptors",
         ),
         Claim(
-            f"errors in {length}: {clients.done['HTTP requests']:,} requests, {clients.done['actions']:,} actions",
-            sum(clients.errors.values()),
+            f"errors in {length}: {done['HTTP requests']:,} requests, {done['actions']:,} actions",
+            sum(errors.values()),
             0,
             "errors",
         ),
     ]
 
 
-def _quick_claims(trends: list[DescriptorTrend], clients: Load) -> list[Claim]:
+def _quick_claims(trends: list[DescriptorTrend], errors: Counter[str]) -> list[Claim]:
     """Returns the targets of the last full run and those that a quick run can check."""
     latest = load("soak")
     found = []
@@ -122,7 +168,7 @@ def _quick_claims(trends: list[DescriptorTrend], clients: Load) -> list[Claim]:
             0,
             "descriptors",
         ),
-        Claim("errors in a minute of load", sum(clients.errors.values()), 0, "errors"),
+        Claim("errors in a minute of load", sum(errors.values()), 0, "errors"),
     ]
 
 
@@ -152,9 +198,10 @@ def _descriptors(trends: list[DescriptorTrend]) -> Table:
     return Table(title="Descriptors and threads", columns=columns, rows=rows)
 
 
-def _work(clients: Load) -> Table:
-    rows: list[list[str | float | int | None]] = [[name, count] for name, count in sorted(clients.done.items())]
-    rows += [[f"error: {name}", count] for name, count in sorted(clients.errors.items())]
+def _work(done: Counter[str], errors: Counter[str], waited_percent: float) -> Table:
+    rows: list[list[str | float | int | None]] = [[name, count] for name, count in sorted(done.items())]
+    rows += [[f"error: {name}", count] for name, count in sorted(errors.items())]
+    rows.append(["share of the time in which a program of this machine waited for a processor, %", waited_percent])
     return Table(title="Completed operations", columns=["operation", "count"], rows=rows)
 
 

@@ -210,6 +210,7 @@ def start_program(program: str, home: Path, port: int, settings: Mapping[str, st
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        start_new_session=True,  # Ctrl-C only reaches the caller, which stops the product after its own work
     )
     lines: list[str] = []
     assert process.stdout is not None

@@ -1,6 +1,7 @@
 """The soak benchmark samples the product's processes and finds growth in the samples."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 
 from benchmarks.soak.processes import CHILDREN, STARTER, TOTAL, ProcessWatcher, Sample, sample_parts
 from benchmarks.soak.trends import after_warm_up, reduced_to_medians, theil_sen
+from benchmarks.suites.soak import ended_by_signal, log_errors
 from tests.harness.network.brokers import wait_until
 
 MINUTES = range(50)
@@ -71,3 +73,23 @@ def test_samples_are_written_during_the_run(tmp_path: Path) -> None:
     head, first, *_ = file.read_text().splitlines()
     assert head.startswith("at_s,part,processes,rss_mb")
     assert first.split(",")[1] == watcher.samples[0].part == STARTER
+
+
+def test_error_lines_of_the_programs_are_counted(tmp_path: Path) -> None:
+    (tmp_path / "agent.log").write_text(
+        "2026-11-24 10:00:00,000 INFO no ERROR here\n2026-11-24 10:00:01,000 ERROR failed [device=arm]\n"
+        "Traceback (most recent call last):\n  File\nValueError: x\n"
+    )
+    (tmp_path / "broker.log").write_text("WARNING a\nERROR infra.broker: b\nready\n")
+    assert log_errors(tmp_path) == {
+        "agent: ERROR failed [device=arm]": 1,
+        "agent: Traceback (most recent call last):": 1,
+        "broker: ERROR infra.broker: b": 1,
+    }
+
+
+def test_a_signal_ends_a_run_with_its_report() -> None:
+    with ended_by_signal() as ended:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert ended.wait(10)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
