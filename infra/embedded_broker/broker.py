@@ -39,7 +39,8 @@ log = logging.getLogger("telescope.broker")
 TCP, WEBSOCKET = "default", "websocket"
 """Listener names; the first is amqtt's default."""
 _TICK_S = 0.25
-_PRIORITY = ("agent:", "service")
+_SERVICE = "service:"
+_PRIORITY = ("agent:", _SERVICE)
 """Beginnings of the principals of agents and of the functions."""
 _RESERVED_SHARE = 10
 """One in this number of clients is reserved for them."""
@@ -194,8 +195,10 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         now_s = time.time()
         if now_s >= grant.expires_at:
             raise Refused(packets.NOT_AUTHORISED, "the token has expired")
-        if grant.expires_at - now_s > self.limits.token_s:
-            raise Refused(packets.NOT_AUTHORISED, f"the token's lifetime exceeds {self.limits.token_s:.0f} s")
+        service = grant.principal.startswith(_SERVICE)
+        longest_s = self.limits.service_token_s if service else self.limits.token_s
+        if grant.expires_at - now_s > longest_s:
+            raise Refused(packets.NOT_AUTHORISED, f"the token's lifetime exceeds {longest_s:.0f} s")
         admission = Admission(grant, connect.password, issued_at(connect.password))
         if self._revocations.covers(grant, admission.issued_at):
             raise Refused(packets.NOT_AUTHORISED, "the token has been revoked")

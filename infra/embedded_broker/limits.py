@@ -27,7 +27,9 @@ class Limits:
         queued_bytes: The same in payload [bytes].
         congested_bytes: Unsent data above which QoS 0 messages are dropped [bytes].
         unsent_bytes: Unsent data above which the connection is closed [bytes].
-        token_s: Maximum remaining lifetime of a token [s]; revocations are stored that long.
+        token_s: Maximum remaining lifetime of a token of an account or agent [s]; revocations are stored that long.
+            The functions issue them for at most one hour.
+        service_token_s: The same for the functions and gateways, whose tokens are not revoked [s].
     """
 
     connections: int = 1_000
@@ -47,7 +49,8 @@ class Limits:
     queued_bytes: int = 32 * 1024 * 1024
     congested_bytes: int = 256 * 1024
     unsent_bytes: int = 4 * 1024 * 1024
-    token_s: float = 30 * 86_400.0
+    token_s: float = 2 * 3_600.0
+    service_token_s: float = 25 * 3_600.0
 
     def within(self, descriptors: int) -> "Limits":
         """Limits that need at most this number of connections."""
