@@ -84,10 +84,15 @@ class Revocations:
                 self._rewrite()
 
     def covers(self, grant: Grant, issued_at: float) -> bool:
-        """Whether a grant whose token was issued at ``issued_at`` [s since 1970] is revoked."""
+        """Whether a grant whose token was issued at ``issued_at`` [s since 1970] is revoked.
+
+        A revocation from further ahead than ``keep_s`` was stamped by a wrong clock. No token that the broker accepts
+        can be as new, and it would lock out the principal until then.
+        """
         fields = [("client_id", grant.client_id), *(("principal", name) for name in covering(grant.principal))]
+        latest = time.time() + self._keep_s
         return ("token_id", grant.token_id) in self._before or any(
-            issued_at <= self._before.get(name, -1.0) for name in fields
+            issued_at <= self._before.get(name, -1.0) <= latest for name in fields
         )
 
     def close(self) -> None:

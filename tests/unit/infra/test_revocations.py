@@ -49,6 +49,14 @@ def test_a_token_id_is_revoked_at_any_time(open_file: Opener) -> None:
     assert not revocations.covers(msgspec.structs.replace(GRANT, token_id="other"), 0.0)
 
 
+def test_a_revocation_by_a_clock_that_was_set_back_later_has_no_effect(open_file: Opener) -> None:
+    revocations, now = open_file(keep_s=50), time.time()
+    revocations.add(Revoke(client_id="c", before_s=now + 400 * 86_400))
+    assert not revocations.covers(GRANT, now)
+    revocations.add(Revoke(principal="p", before_s=now + 40))
+    assert revocations.covers(GRANT, now + 30), "clocks of two machines differ"
+
+
 def test_revocations_survive_a_crash_and_a_truncated_line(open_file: Opener, path: Path) -> None:
     open_file().add(Revoke(client_id="c"))
     with path.open("a") as file:
