@@ -162,6 +162,7 @@ class Load:
                 self.count("leases renewed")
             time.sleep(max(0.0, now_s + _PERIOD_S - time.monotonic()))
         self.count("setpoints", arm.sequence)
+        self.count("holds after a gap in the setpoints", arm.inputs - 1)
         if not arm.applied():
             raise RuntimeError("setpoints were not applied")
 
@@ -274,15 +275,17 @@ class StreamedArm:
         self._newest = codec.decode(telemetry.received.get(timeout=TIMEOUT_S), JointTelemetry)
         self._started_s = time.monotonic()
         self._home_rad = list(self._newest.commanded_rad)
-        self.sequence = 0
+        self.sequence, self.inputs = 0, 1
         telemetry.on_payload = self._on_telemetry
 
     def _on_telemetry(self, payload: bytes) -> None:
         self._newest = codec.decode(payload, JointTelemetry)
 
     def send(self, now_s: float) -> None:
-        """Sends the next setpoint."""
+        """Sends the next setpoint; after a hold of the watchdog with a new input, as an operator does."""
         self.sequence += 1
+        if self._newest.epoch == self.epoch and self._newest.ended_input >= self.inputs:
+            self.inputs = self._newest.ended_input + 1
         target = dict(zip(self._names, self._home_rad, strict=True))
         target[self._names[-1]] += _SWING_RAD * math.sin((now_s - self._started_s) / _SWING_S * math.tau)
         setpoint = Setpoint(
@@ -291,7 +294,7 @@ class StreamedArm:
             echo_tick_ms=self._newest.tick_ms,
             sent_ms=now_s * 1000,
             target=JointTarget(position_rad=target),
-            input=self._newest.ended_input + 1,
+            input=self.inputs,
         )
         self._control.client.publish(self._topic, setpoints.seal(codec.encode(setpoint), self._key, self._topic))
 
