@@ -33,7 +33,7 @@ help:
 	@echo "make test-long       run every test suite at full size"
 	@echo "make check           linters, types, import rules, generated files, unsafe code, committed secrets"
 	@echo "make coverage        unit tests of the agent; every branch of its runtime must be covered"
-	@echo "make bench           run all benchmarks, including one hour of load; writes benchmarks/results and docs/results"
+	@echo "make bench           run all benchmarks, which takes several hours; writes benchmarks/results and docs/results"
 	@echo "make bench-quick     run all benchmarks with fewer samples, in about ten minutes"
 	@echo "make soak            run the simulated laboratory under load for SOAK_HOURS (8); checks memory, descriptors and errors"
 	@echo "make fuzz            run each parser under a fuzzer for SECONDS_EACH (60) seconds"

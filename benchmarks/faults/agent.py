@@ -1,13 +1,11 @@
-"""The agent with a report of each control period and an adjustable wall clock.
+"""The agent with a report of each control period.
 
 ``python -m benchmarks.faults.agent MQTT_PORT WATCHDOG_S …`` sends a datagram per control period (``recorder.Period``)
-and per started action to ``$TELESCOPE_HOME/recorder.socket``. SIGUSR1 and SIGUSR2 move its wall clock forward and back
-by one hour. The product contains no such code.
+and per started action to ``$TELESCOPE_HOME/recorder.socket``. The product contains no such code.
 """
 
 import contextlib
 import os
-import signal
 import socket
 import sys
 import threading
@@ -21,13 +19,10 @@ from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.controller import Controller
 from tests.faults import agent
 
-JUMP_S = 3600.0
-
 
 def main(*arguments: str) -> int:
     """Runs the agent until it is terminated."""
     _report_periods(str(Path(os.environ["TELESCOPE_HOME"]) / "recorder.socket"))
-    _set_clock_by_signals()
     return agent.main(*arguments)
 
 
@@ -64,20 +59,6 @@ def _report_periods(path: str) -> None:
 
     Controller.update = updated  # type: ignore[method-assign,assignment]
     ActionExecutor.start = started  # type: ignore[method-assign,assignment]
-
-
-def _set_clock_by_signals() -> None:
-    offset_s = 0.0
-    seconds, nanoseconds = time.time, time.time_ns
-
-    def jump(number: int, _frame: object) -> None:
-        nonlocal offset_s
-        offset_s += JUMP_S if number == signal.SIGUSR1 else -JUMP_S
-
-    time.time = lambda: seconds() + offset_s
-    time.time_ns = lambda: nanoseconds() + round(offset_s * 1e9)
-    signal.signal(signal.SIGUSR1, jump)
-    signal.signal(signal.SIGUSR2, jump)
 
 
 if __name__ == "__main__":

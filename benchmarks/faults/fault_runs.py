@@ -1,7 +1,6 @@
 """One fault after another: time until a moving arm rests, and time until recovery."""
 
-import os
-import resource
+import contextlib
 import signal
 import time
 from collections.abc import Callable
@@ -10,7 +9,9 @@ from typing import Final
 
 import msgspec
 
-from benchmarks.faults.action_load import ActionLoad, count_returns
+from benchmarks.faults.action_load import ActionLoad, count_returns, false_results, rests
+from benchmarks.faults.crowd import CROWD, Crowd
+from benchmarks.faults.injection import DISK_FULL, Injection
 from benchmarks.faults.operator import FULL_SPEED, FaultOperator
 from benchmarks.faults.processes import ACTION_ARM, STREAMING_ARM, ProductProcesses
 from tests.faults import cuts
@@ -35,10 +36,10 @@ _DETECTED_BY_AGENT: Final = ("agent's link cut", "broker killed")
 """The agent detects these faults, so times count from the cut and not from the last setpoint."""
 _SHUFFLED: Final = "all sent twice, out of order"
 _AGENT_KILLED: Final = "agent killed"
-_DISK_FULL: Final = "agent's disk full"
+_DISTANT: Final = "operator's link: 300 ms round trip, stalls of 2 s"
 _ATTEMPTS: Final = 8
-_RTT_MS: Final = 100.0
-_LOSS: Final = 0.02
+_DISTANT_RTT_MS: Final = 300.0
+_STALL_S: Final = 2.0
 _RECOVERY_TIMEOUT_S: Final = 60.0
 _BEFORE_CUT_MS: Final = 400.0
 
@@ -71,19 +72,18 @@ class FaultRuns(Bench):
         self.load = load
         self.arm, self._wrist = self.arms
         self.arms = [self.arm]
-        self._repaired_ms = 0.0
-        self._faults: dict[str, tuple[Callable[[], object], Callable[[], object]]] = {
-            "100 ms round trip": (lambda: self._network(rtt_ms=_RTT_MS), self._network),
-            "2 % packet loss, retransmitted after 200 ms": (lambda: self._network(loss=_LOSS), self._network),
-            "agent's clock an hour ahead": (lambda: self._clock(signal.SIGUSR1), lambda: self._clock(signal.SIGUSR2)),
-            "agent's clock an hour back": (lambda: self._clock(signal.SIGUSR2), lambda: self._clock(signal.SIGUSR1)),
-            _DISK_FULL: (lambda: self._disk(full=True), lambda: self._disk(full=False)),
-        }
+        self._begun_ms = self._repaired_ms = 0.0
+        self.crowd = Crowd(product)
+        self._faults = Injection(product, self.crowd).faults
+        self._untraced_ms: list[tuple[float, float]] = []
+        """Times between a full disk, which ends the simulation's trace, or an exit, and the next start of the agent."""
+        self._ended_ms: list[float] = []
+        """Times at which the agent was killed."""
 
     @property
     def names(self) -> list[str]:
-        """Names of all faults. The full disk ends the simulation's trace; the killed agent starts a new one."""
-        return [*_CUTS, _SHUFFLED, *self._faults, _AGENT_KILLED]
+        """Names of all faults."""
+        return [*_CUTS, _DISTANT, _SHUFFLED, *self._faults, _AGENT_KILLED]
 
     def close(self) -> None:
         """Stops the operators and closes the traces."""
@@ -96,26 +96,41 @@ class FaultRuns(Bench):
         verdict, reordered = None, 0
         if fault in _CUTS:
             verdict = self._cut(_CUTS[fault])
+        elif fault == _DISTANT:
+            verdict = self._distant()
         elif fault == _SHUFFLED:
             verdict, reordered = self._shuffled()
         elif fault == _AGENT_KILLED:
             self._kill_agent()
         else:
-            verdict = self._during_fault(*self._faults[fault], by_recorder=fault == _DISK_FULL)
+            if fault == CROWD:
+                self.crowd.populate()
+            verdict = self._during_fault(*self._faults[fault], by_recorder=fault == DISK_FULL)
+        recovery_s = round(self._recover(), 2)
+        if fault == DISK_FULL:
+            self._restart_agent()
         return FaultResult(
             fault=fault,
             broker=self.product.kind,
             stop_ms=None
             if verdict is None
             else round(verdict.cut_ms if fault in _DETECTED_BY_AGENT else verdict.rest_ms, 1),
-            recovery_s=round(self._recover(), 2),
+            recovery_s=recovery_s,
             moved_again=verdict is not None and verdict.moved_again,
             reordered=reordered,
         )
 
-    def count_repeated_actions(self) -> int:
-        """Counts repeated actions of the other arm in the trace."""
-        return count_returns([row.target_rad[-1] for row in self._wrist.record.read()])
+    def compare_actions(self) -> tuple[int, list[str]]:
+        """Compares the actions of the other arm with the trace: number of repeated ones, and false results."""
+        targets_rad = {each.number: self.load.target_rad(each.number) for each in self.load.actions}
+        visits = list(rests(self._wrist.record.read(), targets_rad))
+        traced = [
+            each
+            for each in self.load.actions
+            if not any(begin_ms <= each.requested_ms <= end_ms for begin_ms, end_ms in self._untraced_ms)
+        ]
+        first_ms = {number: at_ms for at_ms, number in reversed(visits)}
+        return count_returns(number for _, number in visits), list(false_results(traced, first_ms, self._ended_ms))
 
     # ------------------------------------------------------------ rounds
 
@@ -146,11 +161,43 @@ class FaultRuns(Bench):
 
         return timed
 
-    def _during_fault(self, begin: Callable[[], object], repair: Callable[[], object], *, by_recorder: bool) -> Verdict:
-        """Kills the operator during a fault; ``by_recorder``: the trace has ended, use the recorded periods."""
+    def _distant(self) -> Verdict:
+        """Gives the link of an operator a long round trip while the arm moves, and stalls it.
+
+        The agent refuses setpoints of such an age, so the arm must rest and stay at rest.
+        """
         for _ in range(_ATTEMPTS):
-            while not self.arm.set_in_motion():
-                pass
+            self._set_in_motion()
+            time.sleep(self.rng.uniform(0.0, 0.6))
+            self.product.operator_network.set(rtt_ms=_DISTANT_RTT_MS)
+            cut_ms = now_ms()
+            time.sleep(self.rng.uniform(0.6, 1.2))
+            thaw = super()._cut_operator(self.arm, cuts.STALLS)
+            time.sleep(_STALL_S)
+            thaw()
+            time.sleep(0.5)
+            found = self.arm.verdict(cuts.STALLS, cut_ms, self._last_applied_ms(cut_ms))
+            self._repaired_ms = now_ms()
+            self.product.operator_network.set(rtt_ms=0.0)
+            if found.in_motion:
+                break
+        return found
+
+    def _last_applied_ms(self, cut_ms: float) -> float:
+        """Returns the time of the last period after a cut that applied a new setpoint."""
+        periods = self.product.recorder.since(STREAMING_ARM, cut_ms)
+        return max((later.at_ms for one, later in pairwise(periods) if later.sequence > one.sequence), default=cut_ms)
+
+    def _during_fault(
+        self, begin: Callable[[], object], repair: Callable[[], object], *, by_recorder: bool
+    ) -> Verdict | None:
+        """Kills the operator during a fault and returns the effect; None if the fault ended the agent.
+
+        ``by_recorder``: the trace has ended; use the recorded periods.
+        """
+        for _ in range(_ATTEMPTS):
+            self._set_in_motion()
+            self._begun_ms = now_ms()
             begin()
             time.sleep(self.rng.uniform(0.5, 0.9))
             assert self.arm.console is not None
@@ -158,7 +205,11 @@ class FaultRuns(Bench):
             cut_ms = now_ms()
             time.sleep(0.7)
             since_ms = self.arm.last_setpoint_ms(cut_ms)
-            if by_recorder:
+            cut_ms = min(cut_ms, since_ms)  # the fault may have ended the setpoints before
+            if self.product.agent.exited:
+                self._untraced_ms.append((self._begun_ms, now_ms()))
+                found = None
+            elif by_recorder:
                 found = judge(
                     self.product.recorder.rows(STREAMING_ARM, cut_ms - _BEFORE_CUT_MS), cut_ms=cut_ms, since_ms=since_ms
                 )
@@ -167,7 +218,7 @@ class FaultRuns(Bench):
             self._repaired_ms = now_ms()
             repair()
             self.arm.close_console()
-            if found.in_motion:
+            if found is None or found.in_motion:
                 break
         return found
 
@@ -201,33 +252,32 @@ class FaultRuns(Bench):
         return verdict, sum(later < earlier for earlier, later in pairwise(sequences))
 
     def _kill_agent(self) -> None:
-        while not self.arm.set_in_motion():
-            pass
+        self._set_in_motion()
         self.product.signal(self.product.agent, signal.SIGKILL)
+        self._ended_ms.append(now_ms())
         time.sleep(0.3)
         self._repaired_ms = now_ms()
         self.product.restart(self.product.agent)
 
+    def _restart_agent(self) -> None:
+        """Starts a new trace after a full disk."""
+        self.product.signal(self.product.agent, signal.SIGKILL)
+        self.product.restart(self.product.agent)
+        self._recover()
+        self._untraced_ms.append((self._begun_ms, now_ms()))
+
+    def _set_in_motion(self) -> None:
+        """Takes control and moves the arm; repeats it while the product has not recovered."""
+        for _ in range(_ATTEMPTS):
+            with contextlib.suppress(AssertionError):
+                if self.arm.set_in_motion():
+                    return
+        raise TimeoutError("the arm cannot be moved")
+
     def _recover(self) -> float:
-        while not self.arm.set_in_motion():
-            pass
+        self._set_in_motion()
         moving_ms = now_ms()
         wait_until(lambda: self.load.done_since(self._repaired_ms), "a new completed action", _RECOVERY_TIMEOUT_S)
         done_ms = self.load.done_since(self._repaired_ms)
         assert done_ms is not None
         return (max(moving_ms, done_ms) - self._repaired_ms) / 1000
-
-    # ------------------------------------------------------------ fault injection
-
-    def _network(self, *, rtt_ms: float = 0.0, loss: float = 0.0) -> None:
-        self.product.network.set(rtt_ms=rtt_ms, loss=loss)
-
-    def _clock(self, number: int) -> None:
-        """Sends the signal to the agent's own process."""
-        os.kill(self.product.pid(self.product.agent), number)
-
-    def _disk(self, *, full: bool) -> None:
-        """Limits the file size of the agent to zero, so each write fails as on a full disk."""
-        process = self.product.pid(self.product.agent)
-        _, hard = resource.prlimit(process, resource.RLIMIT_FSIZE)
-        resource.prlimit(process, resource.RLIMIT_FSIZE, (0 if full else hard, hard))

@@ -1,7 +1,6 @@
 """The product in processes that can be killed separately, with an agent that reports its decisions."""
 
 import contextlib
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -10,10 +9,11 @@ import httpx
 from benchmarks.baseline.product import MqttClient, broker_credentials
 from benchmarks.faults.recorder import Recorder
 from function_app import settings
+from infra.local.supervisor import SupervisedProcess
 from tests.faults.stack import Stack
 from tests.harness.cloud.cloud import Cloud
 from tests.harness.cloud.people import sign_in_link
-from tests.harness.network.brokers import BrokerKind
+from tests.harness.network.brokers import BrokerKind, wait_until
 from tests.harness.network.delay import start_delay
 from tests.harness.network.proxy import Proxy
 
@@ -28,6 +28,7 @@ class ProductProcesses(Stack):
     Attributes:
         recorder: Recorded control periods of the agent.
         network: Simulated network between the agent and the broker.
+        operator_network: The same between the operators and the broker.
         owner: HTTP client with a sign-in session, for requests that an API key may not make.
     """
 
@@ -49,8 +50,13 @@ class ProductProcesses(Stack):
         self.owner.cookies.clear()
         self.cloud = self._closing.enter_context(Cloud(settings.read(self._environment)))
 
+    def _child(self, name: str, module: str, *arguments: str) -> SupervisedProcess:
+        return super()._child(name, "benchmarks.faults.launcher", module, *arguments)
+
     def _proxy(self, behind: int, received: Callable[[bytes], None]) -> Proxy:
         self.network = self._closing.enter_context(start_delay(behind, rtt_ms=0))
+        self.operator_network = self._closing.enter_context(start_delay(behind, rtt_ms=0))
+        self.operator_port = self.operator_network.ports[behind]
         return super()._proxy(self.network.ports[behind], received)
 
     def device(self, name: str) -> str:
@@ -84,11 +90,8 @@ class ProductProcesses(Stack):
         self.agent.stop()
         self.agent = self._child("agent", self.AGENT, *self.agent_arguments(self.port + 1))
         self.agent.wait_for_line("running", 60)
-        deadline_s = time.monotonic() + 60
-        while not all(each["online"] for each in self.devices()):
-            if time.monotonic() > deadline_s:
-                raise TimeoutError("the devices did not come online after the restart")
-            time.sleep(0.1)
+        own = [self.device(name) for name in self.names]
+        wait_until(lambda: all(self.http.get(each).json()["online"] for each in own), "the devices to be online")
 
 
 @contextlib.contextmanager

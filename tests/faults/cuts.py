@@ -21,13 +21,8 @@ from tests.faults.judge import MOST_MS, Record, Verdict, judge, quantile
 from tests.faults.stack import MOVEMENT, PATIENCE_S, Console, Stack, now_ms
 
 Repair = Callable[[], None]
-OPERATOR = (
-    "console killed",
-    "console stopped",
-    "operator disconnected",
-    "operator's link stalls",
-    "operator's link dropped",
-)
+STALLS = "operator's link stalls"
+OPERATOR = ("console killed", "console stopped", "operator disconnected", STALLS, "operator's link dropped")
 SCRIPT = ("script's processes killed",)
 SHARED = (
     "agent disconnected", "agent's link stalls", "agent's link dropped", "broker killed", "broker stopped",

@@ -94,6 +94,7 @@ class Stack:
         self.names = [f"arm{number}" for number in range(arms)]
         self.home = Path(tempfile.mkdtemp(prefix="ts-"))  # the path of a Unix socket has at most 108 bytes
         self.port = free_ports()
+        self.operator_port = self.port + 1
         self.setpoints: dict[str, list[float]] = defaultdict(list)
         self.commands: dict[str, list[float]] = defaultdict(list)
         self._environment = os.environ | {
@@ -175,7 +176,7 @@ class Stack:
         """A new operator of this arm."""
         path = self.home / f"{name}.socket"
         path.unlink(missing_ok=True)
-        proxy = Proxy(self.port + 1)
+        proxy = Proxy(self.operator_port)
         with socket.socket(socket.AF_UNIX) as listener:
             listener.bind(str(path))
             listener.listen(1)
