@@ -13,8 +13,11 @@ import msgspec
 
 from tests.faults.judge import Row
 
-STEP_RAD: Final = 0.002
-"""Action number n moves the wrist to n times this angle, so the simulation's trace identifies the action."""
+STEP_RAD: Final = 2e-4
+"""Action number n moves the wrist to n times this angle, so the simulation's trace identifies the action.
+
+Thirty thousand actions, a run of some hours, stay within the range of the wrist.
+"""
 _TERMINAL: Final = ("done", "failed", "expired", "cancelled")
 _TTL_MS: Final = 4000
 _TIMEOUT_S: Final = 20.0

@@ -83,7 +83,7 @@ class Machine:
 
     def pid(self, words: str) -> int:
         """Id of the product's process whose command line contains these words."""
-        listed = subprocess.run(["ps", "-eo", "pid,ppid,args"], capture_output=True, text=True, check=True).stdout
+        listed = subprocess.run(["ps", "-wweo", "pid,ppid,args"], capture_output=True, text=True, check=True).stdout
         found = [line for line in listed.splitlines() if words in line and int(line.split()[1]) == self.process.pid]
         assert len(found) == 1, f"{words}: {found}"
         return int(found[0].split()[0])

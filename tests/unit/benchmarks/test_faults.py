@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.faults.action_load import (
     STEP_RAD,
+    ActionLoad,
     RequestedAction,
     count_returns,
     duplicated,
@@ -16,7 +17,7 @@ from benchmarks.faults.action_load import (
     rests,
 )
 from benchmarks.faults.fault_runs import FaultResult
-from benchmarks.faults.kills import Kill, Verdict
+from benchmarks.faults.kills import Kill, KillLoad, Verdict
 from benchmarks.faults.recorder import Period, Recorder
 from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, StopResult, evaluate
 from benchmarks.suites.faults import Counts, claims, faults_table, stops_table
@@ -50,9 +51,14 @@ def test_a_return_to_an_earlier_target_is_counted(steps: tuple[float, ...], coun
     assert count_returns(number for _, number in rests(trace, targets_rad)) == count
 
 
+def test_targets_stay_within_the_range_of_the_wrist_for_a_full_run() -> None:
+    assert ActionLoad.target_rad(30_000) < math.tau
+    assert KillLoad.target_rad(2_000) < math.tau
+
+
 def test_positions_on_the_way_are_not_targets() -> None:
     trace = [Row(10.0 * each, (each * 1e-4,)) for each in range(100)]
-    trace += [Row(2000.0 + 10 * each, (0.01,)) for each in range(4)]
+    trace += [Row(2000.0 + 10 * each, (5 * STEP_RAD,)) for each in range(4)]
     assert list(rests(trace, {number: number * STEP_RAD for number in range(1, 10)})) == [(2020.0, 5)]
 
 
