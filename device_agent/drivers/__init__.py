@@ -15,7 +15,7 @@ from device_agent.protocol.manifests.robot_type import RobotType
 __all__ = ["GROUP", "Factory", "load", "names"]
 
 GROUP = "telescope.drivers"
-_BUILT_IN: Mapping[str, str] = {"mujoco": "device_agent.drivers.mujoco"}
+_BUILT_IN: Mapping[str, str] = {"mujoco": "device_agent.drivers.mujoco", "ur": "device_agent.drivers.ur"}
 """Name → module that defines ``create``."""
 
 

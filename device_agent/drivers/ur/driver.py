@@ -1,0 +1,199 @@
+"""Driver of one arm. ``device_agent/ports/driver.py`` documents each method."""
+
+import contextlib
+import math
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from device_agent.drivers.ur import modes, program
+from device_agent.drivers.ur.connection import Connection, Measurement
+from device_agent.drivers.ur.starter import ProgramStarter
+from device_agent.ports.driver import DriverError, DriverFault, Observation, UnreachableError
+from device_agent.protocol import Twin
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.simulation.mjcf.robot_model import RobotModel
+
+ORDER = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+"""Joints in the controller's order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Controller:
+    """Where the controller is, and how fast it reports.
+
+    Attributes:
+        host: Host name or IP address.
+        rtde_port: Port of RTDE.
+        script_port: Port of the secondary interface, which takes programs.
+        frequency_hz: Rate of measurements [Hz].
+    """
+
+    host: str
+    rtde_port: int
+    script_port: int
+    frequency_hz: float
+
+
+class UrDriver:
+    """Drives one arm by a program at its controller, which follows setpoints and has its own watchdog.
+
+    It implements ``ReportsFaults`` and ``ReportsStreams`` (stream ``health``). ``effort_nm`` is the torque that the
+    controller computes for the motion; contact forces are not included.
+
+    Args:
+        robot_type: Joints, limits and frames; its joints are those of ``ORDER``.
+        folder: Folder of the robot type, for its model.
+        controller: The controller.
+        device: Id of the device at its agent.
+    """
+
+    def __init__(self, robot_type: RobotType, folder: Path, controller: Controller, device: str) -> None:
+        self._type = robot_type
+        self._names = [joint.name for joint in robot_type.joints]
+        self._to_controller = [self._names.index(name) for name in ORDER]
+        self._from_controller = [ORDER.index(name) for name in self._names]
+        self._model = RobotModel(robot_type, folder)
+        self._controller = controller
+        self._device = device
+        self._session = 0
+        self._connection: Connection | None = None
+        self._starter: ProgramStarter | None = None
+        self._halted = False
+
+    @property
+    def simulated(self) -> bool:
+        """Always False, also at a controller that simulates its arm."""
+        return False
+
+    def connect(self) -> None:
+        """Connect and start the program; the arm holds its position."""
+        self.close()
+        self._halted = False
+        self._session = secrets.randbelow(2**31 - 1) + 1
+        controller = self._controller
+        self._connection = Connection(
+            (controller.host, controller.rtde_port),
+            session=self._session,
+            frequency_hz=controller.frequency_hz,
+            device=self._device,
+        )
+        script = program.script(
+            self._session,
+            max_velocity_rad_s=[self._type.joints[index].max_velocity_rad_s for index in self._to_controller],
+            braking_rad_s2=self._type.braking_rad_s2,
+        )
+        self._starter = ProgramStarter(
+            (controller.host, controller.script_port),
+            script,
+            session=self._session,
+            connection=self._connection,
+            device=self._device,
+        )
+        try:
+            self._starter.wait()
+        except UnreachableError:
+            self.close()
+            raise
+
+    def twin(self) -> Twin | None:
+        """The model of the robot type; it needs no connection."""
+        return self._model.twin(self._device)
+
+    def observe(self) -> Observation:
+        """The newest measurement."""
+        newest = self._connected().measurement
+        position = self._ordered(newest.position_rad)
+        return Observation(
+            position,
+            self._ordered(newest.velocity_rad_s),
+            self._ordered(newest.effort_nm),
+            self._model.frames(position),
+            at_s=newest.at_s,
+        )
+
+    def faults(self) -> tuple[DriverFault, ...]:
+        """Safety modes, modes of the arm, and a program that was ended or paused at the robot."""
+        newest = None if self._connection is None else self._connection.newest
+        fault = None if newest is None else self._fault(newest)
+        return () if fault is None else (fault,)
+
+    def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
+        """Command positions within the limits of the joints."""
+        connection = self._free()
+        if len(position_rad) != len(self._names):
+            raise DriverError(f"{len(position_rad)} positions for {len(self._names)} joints")
+        if not all(map(math.isfinite, position_rad)):
+            raise DriverError("a commanded position is not finite")
+        applied = tuple(
+            min(max(value, joint.lower_rad), joint.upper_rad)
+            for value, joint in zip(position_rad, self._type.joints, strict=True)
+        )
+        connection.command([applied[index] for index in self._to_controller])
+        return applied
+
+    def report(self, stream: str) -> Mapping[str, float | bool]:
+        """``health``: temperatures of the joints [°C], and torques as a share of their maximum."""
+        connection = self._connection
+        newest = None if connection is None else connection.newest
+        if stream != "health" or newest is None:
+            return {}
+        values: dict[str, float | bool] = {}
+        for joint, celsius, torque in zip(
+            self._type.joints, self._ordered(newest.temperature_c), self._ordered(newest.effort_nm), strict=True
+        ):
+            values[f"temperature_c.{joint.name}"] = round(celsius, 2)
+            values[f"load.{joint.name}"] = round(abs(torque) / joint.max_effort_nm, 3)
+        return values
+
+    def halt(self) -> None:
+        """End the program, which brakes. Its watchdog does the same if the connection is lost."""
+        self._halted = True
+        connection = self._connection
+        if connection is not None:
+            connection.end()
+
+    def close(self) -> None:
+        """End the program and the connection."""
+        starter, self._starter = self._starter, None
+        if starter is not None:
+            starter.close()
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            with contextlib.suppress(UnreachableError):
+                connection.end()
+            connection.close()
+
+    def _fault(self, newest: Measurement) -> DriverFault | None:
+        fault = modes.fault(newest.safety_mode, newest.robot_mode)
+        if fault is not None or self._halted or newest.runs(self._session):
+            return fault
+        if newest.session == self._session and newest.runtime_state == modes.PAUSED:
+            return DriverFault("program-paused", "the program was paused at the robot; continue it there")
+        return DriverFault(
+            "program-ended", "the program was ended at the robot; restart the agent if nobody works at the robot"
+        )
+
+    def _connected(self) -> Connection:
+        if self._connection is None:
+            raise UnreachableError(f"'{self._device}' is not connected")
+        return self._connection
+
+    def _free(self) -> Connection:
+        """The connection, if the arm may move.
+
+        Raises:
+            DriverError: It is halted, lost, or has stopped itself.
+        """
+        connection = self._connected()
+        if self._halted:
+            raise DriverError("the arm was halted; it reconnects")
+        fault = self._fault(connection.measurement)
+        if fault is not None:
+            raise DriverError(f"the arm has stopped itself: {fault.message}")
+        return connection
+
+    def _ordered(self, values: Sequence[float]) -> tuple[float, ...]:
+        """Values in the robot type's order of the joints."""
+        return tuple(values[index] for index in self._from_controller)

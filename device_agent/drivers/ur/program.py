@@ -1,0 +1,92 @@
+"""The URScript program that moves the robot. The controller executes it; setpoints arrive in RTDE input registers.
+
+The program holds the robot until the setpoint counter changes. It approaches setpoints at no more than the joints'
+maximum velocities. If the counter does not change for ``WATCHDOG_S``, it brakes and holds. It ends for good when its
+session number appears in the register ``END``, so that a delayed setpoint moves nothing afterwards.
+"""
+
+from collections.abc import Sequence
+
+WATCHDOG_S = 0.1
+"""Longest time between two setpoints before the program brakes [s]."""
+
+SESSION, COUNTER, END = 24, 25, 26
+"""Integer input registers: the session, the counter of setpoints, and the session that has to end."""
+TARGET = 24
+"""First of six float input registers: the setpoint [rad]."""
+RUNNING, BEAT = 24, 25
+"""Integer output registers: the session of the running program, and a counter of its cycles.
+
+Registers from 24 on are reserved for RTDE clients; lower ones belong to fieldbus adapters."""
+
+_TEXT = """\
+def telescope():
+  session = {session}
+  limit = {velocity}
+  timeout = {watchdog}
+  counter = -1
+  q = get_target_joint_positions()
+  age = 0.0
+  beat = 0
+  moving = False
+  write_output_integer_register({RUNNING}, session)
+  while read_input_integer_register({END}) != session:
+    beat = beat + 1
+    write_output_integer_register({BEAT}, beat)
+    newest = read_input_integer_register({COUNTER})
+    age = age + get_steptime()
+    if read_input_integer_register({SESSION}) == session and newest != counter:
+      counter = newest
+      age = 0.0
+      if not moving:
+        q = get_target_joint_positions()
+        moving = True
+      end
+    end
+    if not moving:
+      sync()
+    elif age > timeout:
+      stopj({braking})
+      moving = False
+    else:
+      i = 0
+      while i < 6:
+        step = limit[i] * get_steptime()
+        change = read_input_float_register({TARGET} + i) - q[i]
+        if change > step:
+          change = step
+        elif change < -step:
+          change = -step
+        end
+        q[i] = q[i] + change
+        i = i + 1
+      end
+      servoj(q, 0, 0, get_steptime(), 0.05, 500)
+    end
+  end
+  stopj({braking})
+  write_output_integer_register({RUNNING}, 0)
+end
+"""
+
+
+def script(session: int, *, max_velocity_rad_s: Sequence[float], braking_rad_s2: float) -> str:
+    """The program of one session.
+
+    Args:
+        session: Number that no other session has.
+        max_velocity_rad_s: Velocity limits of the joints, in the controller's order, shape (6,) [rad/s].
+        braking_rad_s2: Deceleration to rest [rad/s²].
+    """
+    return _TEXT.format(
+        session=session,
+        velocity=[float(value) for value in max_velocity_rad_s],
+        watchdog=WATCHDOG_S,
+        braking=float(braking_rad_s2),
+        COUNTER=COUNTER,
+        END=END,
+        SESSION=SESSION,
+        TARGET=TARGET,
+        RUNNING=RUNNING,
+        BEAT=BEAT,
+    )
