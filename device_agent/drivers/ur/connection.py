@@ -32,7 +32,8 @@ _SETPOINT = (
     *((f"input_double_register_{program.TARGET + index}", "DOUBLE") for index in range(JOINTS)),
 )
 _END = ((f"input_int_register_{program.END}", "INT32"),)
-"""A recipe of its own, so that a setpoint sent by another thread cannot overwrite it."""
+_CANCELLED = ((f"input_int_register_{program.CANCELLED}", "INT32"),)
+"""Recipes of their own, so that a setpoint sent by another thread cannot overwrite them."""
 
 _TIMEOUT_S = 2.0
 """Time to connect, for all responses, and to the second measurement [s]."""
@@ -95,7 +96,7 @@ class Connection:
     def __init__(self, address: tuple[str, int], *, session: int, frequency_hz: float, device: str) -> None:
         self._where = f"{address[0]}:{address[1]}"
         self._session = session
-        self._counter = 0
+        self._counter = session  # random, as a first setpoint with the number of an old one would be ignored
         self._closed = threading.Event()
         self._ready = threading.Event()
         self._buffer = bytearray()
@@ -142,6 +143,14 @@ class Connection:
         self._counter = (self._counter + 1) % 2**31
         self._send(self._setpoint.pack([self._session, self._counter, *position_rad]))
 
+    def cancel(self) -> None:
+        """Let the program not follow the last setpoint any more, also after a pause.
+
+        Raises:
+            UnreachableError: As for ``command``.
+        """
+        self._send(self._cancelled.pack([self._counter]))
+
     def end(self) -> None:
         """End the program of this session: it brakes. Neither blocks nor waits for a lock.
 
@@ -164,6 +173,7 @@ class Connection:
             self._outputs = setup.outputs(_OUTPUTS, frequency_hz)
             self._setpoint = setup.inputs(_SETPOINT)
             self._end = setup.inputs(_END)
+            self._cancelled = setup.inputs(_CANCELLED)
             setup.start()
         except OSError as error:
             raise UnreachableError(f"{self._where} does not respond: {error}; is it an RTDE port?") from error

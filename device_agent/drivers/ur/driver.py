@@ -79,9 +79,11 @@ class UrDriver:
             frequency_hz=controller.frequency_hz,
             device=self._device,
         )
+        joints = [self._type.joints[index] for index in self._to_controller]
         script = program.script(
             self._session,
-            max_velocity_rad_s=[self._type.joints[index].max_velocity_rad_s for index in self._to_controller],
+            max_velocity_rad_s=[joint.max_velocity_rad_s for joint in joints],
+            max_acceleration_rad_s2=[joint.max_acceleration_rad_s2 for joint in joints],
             braking_rad_s2=self._type.braking_rad_s2,
         )
         self._starter = ProgramStarter(
@@ -172,7 +174,7 @@ class UrDriver:
         if newest.session == self._session and newest.runtime_state == modes.PAUSED:
             return DriverFault("program-paused", "the program was paused at the robot; continue it there")
         return DriverFault(
-            "program-ended", "the program was ended at the robot; restart the agent if nobody works at the robot"
+            "program-ended", "the program was ended at the robot; select remote control, then restart the agent"
         )
 
     def _connected(self) -> Connection:

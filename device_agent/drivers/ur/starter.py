@@ -1,5 +1,6 @@
 """Starts the program at the controller, once per session and again after each stop of the robot itself."""
 
+import contextlib
 import socket
 import threading
 import time
@@ -65,10 +66,14 @@ class ProgramStarter:
     def _run(self) -> None:
         while not self._stopping.wait(_CHECK_S):
             newest = self._connection.newest
-            if newest is not None and modes.fault(newest.safety_mode, newest.robot_mode) is not None:
+            stopped = newest is not None and modes.fault(newest.safety_mode, newest.robot_mode) is not None
+            if stopped:
                 self._needed = True
                 self._settled.set()
-            elif self._needed:
+            if newest is not None and (stopped or newest.runtime_state == modes.PAUSED):
+                with contextlib.suppress(UnreachableError):
+                    self._connection.cancel()
+            if self._needed and not stopped:
                 self._start()
 
     def _start(self) -> None:

@@ -23,6 +23,7 @@ class Controller:
 
     Attributes:
         remote: Whether it takes programs from the network.
+        each_cycle: Called after each cycle.
     """
 
     def __init__(self, position_rad: Sequence[float]) -> None:
@@ -36,6 +37,7 @@ class Controller:
         self.robot_mode = RUNNING
         self.runtime_state = STOPPED
         self.remote = True
+        self.each_cycle: Callable[[Controller], None] = lambda _: None
         self.started_programs = 0
         self._program: Iterator[tuple[str, Any]] | None = None
         self._stop_rad_s2 = 0.0
@@ -98,6 +100,7 @@ class Controller:
                 self._accelerate(joint, 0.0, argument or _STOP_RAD_S2)
         for joint in range(JOINTS):
             self.position[joint] += self.velocity[joint] * CYCLE_S
+        self.each_cycle(self)
 
     def _call(self) -> tuple[str, Any]:
         """What the program calls in this cycle. ``stopj`` lasts until the arm is at rest."""
