@@ -150,11 +150,18 @@ def test_a_paused_program_continues_without_a_motion(driver: UrDriver, peer: UrP
 
 def test_two_sessions_do_not_move_each_others_program(driver: UrDriver, peer: UrPeer) -> None:
     driver.connect()
+    connection = driver._connection
+    assert connection is not None
     other = UrDriver(TYPE, UR5, Controller("127.0.0.1", peer.rtde_port, peer.script_port, 125.0), "other")
     other.connect()
     until(lambda: codes(driver) == ["program-ended"])
     with pytest.raises(DriverError):
         driver.send([value + 0.1 for value in HOME])
+    for _ in range(20):
+        connection.command([value + 0.1 for value in HOME])
+    sent_s = peer.controller.time_s
+    peer.wait(lambda controller: controller.time_s > sent_s + 0.3)
+    assert peer.joint_positions() == pytest.approx(HOME)
     other.close()
 
 

@@ -95,7 +95,7 @@ class Controller:
             for joint, target in enumerate(argument):
                 wanted = min(max((target - self.position[joint]) / _LAG_S, -MAX_VELOCITY_RAD_S), MAX_VELOCITY_RAD_S)
                 self._accelerate(joint, wanted, _MAX_ACCELERATION_RAD_S2)
-        else:
+        elif call != "sync":  # the worst case: a program that only waits does not end a motion
             for joint in range(JOINTS):
                 self._accelerate(joint, 0.0, argument or _STOP_RAD_S2)
         for joint in range(JOINTS):
