@@ -114,6 +114,12 @@ tests/harness/identity_provider/node_modules/.installed: tests/harness/identity_
 	@$(PIP) --ignore-requires-python --target .venv/azure-worker -r requirements/azure-worker.txt
 	@touch $@
 
+# NAOqi's library has its own interpreter, as at a robot.
+.venv/.naoqi: requirements/naoqi.txt | .venv/.python
+	@$(PYTHON) -m venv --without-pip --clear .venv/naoqi
+	@$(BIN)/python -m pip --python .venv/naoqi/bin/python install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements/naoqi.txt
+	@touch $@
+
 console: web/dist/index.html
 
 web/dist/index.html: web/node_modules/.installed web/index.html web/package.json $(wildcard web/*.ts web/public/*) $(shell find web/src -type f 2>/dev/null)
@@ -129,7 +135,7 @@ system-packages:
 	@tests/system-packages
 
 test-environment: system-packages .venv/.dev console tests/harness/azurite/node_modules/.installed tests/harness/identity_provider/node_modules/.installed \
-	.venv/.azure-worker
+	.venv/.azure-worker .venv/.naoqi
 
 test: test-environment
 	@$(MAKE) --no-print-directory -j 2 check-python check-web

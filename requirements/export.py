@@ -15,6 +15,7 @@ EXPORTS = {
     "requirements/aws.txt": ("functions", "aws"),
     "requirements/agent.txt": ("agent", "sim", "xmpp"),
     "requirements/local.txt": ("local",),
+    "requirements/naoqi.txt": ("naoqi",),
     "requirements/node.txt": ("node",),
     "requirements/bench.txt": ("bench",),
     "requirements/docs.txt": ("docs",),

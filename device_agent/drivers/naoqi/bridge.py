@@ -1,0 +1,270 @@
+"""Connects the driver to NAOqi. Runs as a process of its own, under a Python that has the package ``qi``.
+
+It imports nothing of the agent. Its standard input is a socket on which both sides send JSON objects, one a line. The
+first line configures it. ``connection.py`` documents the messages. When the agent's side closes, or no command arrives
+for ``WATCHDOG_S``, it stops the robot.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import socket
+import sys
+import threading
+import time
+from typing import Any
+
+import qi
+import qi.logging
+
+WATCHDOG_S = 0.25
+"""Longest time between two commands while the robot walks [s]."""
+_CHECK_S = 0.02
+_PERIOD_S = 0.02
+_STATUS_S = 0.1
+_CALL_MS = 500
+_CONNECT_MS = 3000
+_END_S = 1.0
+_MAX_LINE = 65536
+_SENSOR = "Device/SubDeviceList/{}/{}/Value"
+_TIME = "DCM/Time"
+_FALLEN = "robotHasFallen"
+
+
+class Robot:
+    """The robot's services. Commands never wait for an answer, and at most one of each kind is outstanding."""
+
+    def __init__(self, url: str, joints: list[str], velocity_rad_s: list[float]) -> None:
+        self.session = qi.Session()
+        self.session.connect(url, _async=True).value(_CONNECT_MS)
+        self.motion = self.service("ALMotion")
+        self.memory = self.service("ALMemory")
+        self.posture = self.service("ALRobotPosture")
+        self.battery = self.service("ALBattery")
+        self.speech = self.service("ALTextToSpeech")
+        self.joints = joints
+        self.language = str(call(self.speech.getLanguage))
+        limits = [call(self.motion.getLimits, joint)[0] for joint in joints]
+        shares = [limit / row[2] for limit, row in zip(velocity_rad_s, limits)]  # noqa: B905 (older Python)
+        self.fraction = min(1.0, *shares)
+        self.walks = False
+        self._walked_s = -math.inf
+        self._held = False
+        self._lock = threading.Lock()
+        self._angles: Any = None
+        self._move: Any = None
+        self._stop: Any = None
+        self._stop_is_last = False
+        call(self.motion.setMoveArmsEnabled, False, False)  # the agent moves the arms, also while the robot walks
+
+    def service(self, name: str) -> Any:
+        """A proxy of a service."""
+        return self.session.service(name, _async=True).value(_CALL_MS)
+
+    def move_joints(self, angles: list[float | None]) -> None:
+        """Move those joints that have an angle."""
+        targets = {joint: angle for joint, angle in zip(self.joints, angles) if angle is not None}  # noqa: B905
+        with self._lock:
+            if not self._held and not is_running(self._angles):
+                self._set_angles(targets)
+
+    def walk(self, twist: list[float]) -> None:
+        """Walk with a velocity until the next command."""
+        with self._lock:
+            if self._held:
+                return
+            self._walked_s = time.monotonic()
+            if not any(twist):
+                self._stop_walk()
+            elif not is_running(self._move):
+                self.walks, self._stop_is_last = True, False
+                self._move = self.motion.move(*twist, _async=True)
+
+    def check(self) -> None:
+        """Stop a walk without commands. Repeated until a stop that was sent after the last walk is confirmed."""
+        with self._lock:
+            if self.walks and time.monotonic() - self._walked_s > WATCHDOG_S:
+                self._stop_walk()
+
+    def hold(self, *, for_good: bool = False) -> None:
+        """Stop, and hold the measured angles. ``for_good``: reject all later commands."""
+        with self._lock:
+            self._held = self._held or for_good
+            self.walks = True
+            self._stop_walk()
+            try:
+                self._set_angles(dict(zip(self.joints, self.angles())))  # noqa: B905
+            except (RuntimeError, ValueError, TypeError):
+                return  # joints end at their last target, one period away
+
+    def end(self) -> None:
+        """Hold, and wait until the robot has confirmed it."""
+        self.hold(for_good=True)
+        end_s = time.monotonic() + _END_S
+        while (self.walks or is_running(self._angles)) and time.monotonic() < end_s:
+            time.sleep(_CHECK_S / 4)
+            with self._lock:
+                if self.walks:
+                    self._stop_walk()
+
+    def angles(self) -> list[float]:
+        """Measured angles [rad]."""
+        return numbers(call(self.motion.getAngles, self.joints, True), len(self.joints))
+
+    def measurement(self) -> dict[str, Any]:
+        """Joints and the robot's own time [ms]."""
+        at_s = time.monotonic()
+        clock = self.memory.getData(_TIME, _async=True)
+        angles = self.angles()
+        (time_ms,) = numbers([clock.value(_CALL_MS)], 1)
+        return {"type": "measurement", "at_s": at_s, "time_ms": time_ms, "position_rad": angles}
+
+    def status(self) -> dict[str, Any]:
+        """All that changes slowly."""
+        at_s, count = time.monotonic(), len(self.joints)
+        keys = [_SENSOR.format(joint, "Temperature/Sensor") for joint in self.joints]
+        return {
+            "type": "status",
+            "at_s": at_s,
+            "stiffness": numbers(call(self.motion.getStiffnesses, self.joints), count),
+            "temperature_c": numbers(call(self.memory.getListData, keys), count),
+            "fallen": bool(call(self.memory.getData, _FALLEN)),
+            "fall_manager": bool(call(self.motion.getFallManagerEnabled)),
+            "posture": str(call(self.posture.getPostureFamily)),
+            "walks": bool(call(self.motion.moveIsActive)),
+            "pose": numbers(call(self.motion.getRobotPosition, True), 3),
+            "twist": numbers(call(self.motion.getRobotVelocity), 3),
+            "battery_percent": numbers([call(self.battery.getBatteryCharge)], 1)[0],
+        }
+
+    def run(self, task: dict[str, Any]) -> str:
+        """Execute a task to its end; returns its error."""
+        try:
+            if "say" in task:
+                call(self.speech.setLanguage, task["language"] or self.language)
+                self.speech.say(task["say"])
+            elif "stiffness" in task:
+                call(self.motion.setStiffnesses, task["joints"], task["stiffness"])
+        except RuntimeError as error:
+            return str(error) or "NAOqi has rejected it"
+        return ""
+
+    def stop_speech(self) -> None:
+        """End all speech."""
+        self.speech.stopAll(_async=True)
+
+    def _set_angles(self, targets: dict[str, float]) -> None:
+        self._angles = self.motion.setAngles(list(targets), list(targets.values()), self.fraction, _async=True)
+
+    def _stop_walk(self) -> None:
+        """Send a stop, or note a confirmed one. A stop sent before a walk was answered is followed by another."""
+        if self._stop is not None and not self._stop.isRunning():
+            confirmed = self._stop_is_last and not self._stop.hasError()
+            self._stop = None
+            if confirmed:
+                self.walks = False
+        if self._stop is None and self.walks:
+            self._stop_is_last = not is_running(self._move)
+            self._stop = self.motion.stopMove(_async=True)
+
+
+class Bridge:
+    """Reads commands and sends measurements."""
+
+    def __init__(self, link: socket.socket) -> None:
+        self._link = link
+        self._sending = threading.Lock()
+
+    def run(self) -> None:
+        """Run until the agent's side closes."""
+        qi.logging.setLevel(qi.logging.ERROR)
+        lines = self._link.makefile("rb")
+        config = json.loads(lines.readline(_MAX_LINE))
+        try:
+            robot = Robot(config["url"], config["joints"], config["velocity_rad_s"])
+        except (RuntimeError, AttributeError, LookupError, TypeError) as error:
+            self.send({"type": "failure", "message": str(error) or repr(error)})
+            return
+        robot.hold()
+        for target in (self._measure, self._report, self._watch):
+            threading.Thread(target=target, args=(robot,), daemon=True).start()
+        try:
+            for line in iter(lambda: lines.readline(_MAX_LINE), b""):
+                self._accept(robot, json.loads(line))
+        except (OSError, ValueError, KeyError) as error:
+            sys.stderr.write(f"naoqi bridge: {error!r}\n")
+        robot.end()
+
+    def send(self, message: dict[str, Any]) -> None:
+        """Send a message, unless the agent has gone."""
+        data = json.dumps(message, allow_nan=False).encode() + b"\n"
+        try:
+            with self._sending:
+                self._link.sendall(data)
+        except OSError:
+            return  # the main thread notices it too, and stops the robot
+
+    def _accept(self, robot: Robot, command: dict[str, Any]) -> None:
+        if "angles" in command:
+            robot.move_joints(command["angles"])
+        elif "twist" in command:
+            robot.walk(command["twist"])
+        elif "hold" in command:
+            robot.hold(for_good=True)
+        elif "task" in command:
+            threading.Thread(target=self._run_task, args=(robot, command), daemon=True).start()
+        elif "stop_speech" in command:
+            robot.stop_speech()
+
+    def _run_task(self, robot: Robot, task: dict[str, Any]) -> None:
+        self.send({"type": "task", "task": task["task"], "error": robot.run(task)})
+
+    def _measure(self, robot: Robot) -> None:
+        self._repeat(robot, robot.measurement, _PERIOD_S)
+
+    def _report(self, robot: Robot) -> None:
+        self._repeat(robot, robot.status, _STATUS_S)
+
+    def _repeat(self, robot: Robot, read: Any, period_s: float) -> None:
+        """Send what is valid. Ends the process if the connection to the robot is lost."""
+        due_s = time.monotonic()
+        while True:
+            try:
+                self.send(read())
+            except (RuntimeError, ValueError, TypeError):
+                if not robot.session.isConnected():
+                    self.send({"type": "failure", "message": "the robot has closed the connection"})
+                    os._exit(1)
+            now_s = time.monotonic()
+            due_s = max(due_s + period_s, now_s)
+            time.sleep(due_s - now_s)
+
+    def _watch(self, robot: Robot) -> None:
+        while True:
+            time.sleep(_CHECK_S)
+            robot.check()
+
+
+def is_running(future: Any) -> bool:
+    """Whether a call is unanswered."""
+    return future is not None and bool(future.isRunning())
+
+
+def call(method: Any, *arguments: Any) -> Any:
+    """The result of a call. Raises ``RuntimeError`` if there is none in time."""
+    return method(*arguments, _async=True).value(_CALL_MS)
+
+
+def numbers(values: Any, count: int) -> list[float]:
+    """Finite numbers. Raises ``ValueError`` or ``TypeError`` for anything else."""
+    result = [float(value) for value in values if not isinstance(value, (str, bytes))]
+    if len(result) != count or not all(map(math.isfinite, result)):
+        raise ValueError("not the expected number of finite values")
+    return result
+
+
+if __name__ == "__main__":
+    Bridge(socket.socket(fileno=os.dup(0))).run()
+    os._exit(0)  # the library's threads may hang

@@ -1,0 +1,247 @@
+"""One connection to NAOqi through the bridge process, with JSON messages, one a line."""
+
+import contextlib
+import logging
+import socket
+import subprocess
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from device_agent.ports.driver import UnreachableError
+from device_agent.ports.skills import SkillError
+from device_agent.ports.threads import SupervisedThread
+
+_START_S = 8.0
+"""Time until the first measurement [s]; it includes the start of the bridge's Python."""
+_OLD_S = 1.0
+_END_S = 2.0
+_CHECK_S = 0.1
+_MAX_LINE = 65536
+_BRIDGE = Path(__file__).with_name("bridge.py")
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How to reach the robot.
+
+    Attributes:
+        url: Address of NAOqi: ``tcp://nao.local:9559``.
+        python: Interpreter that has the package ``qi``.
+        joints: NAOqi's names of the joints, in the order of all values.
+        velocity_rad_s: Highest velocity of each joint [rad/s].
+    """
+
+    url: str
+    python: str
+    joints: tuple[str, ...]
+    velocity_rad_s: tuple[float, ...]
+
+
+class Measurement(msgspec.Struct, frozen=True, tag="measurement"):
+    """Measured joints. ``at_s``: on the monotonic clock of this machine; ``time_ms``: on the robot's clock."""
+
+    at_s: float
+    time_ms: float
+    position_rad: tuple[float, ...]
+
+
+class Status(msgspec.Struct, frozen=True, tag="status"):
+    """Values that change slowly. ``stiffness`` and ``temperature_c`` are in the order of the joints."""
+
+    at_s: float
+    stiffness: tuple[float, ...]
+    temperature_c: tuple[float, ...]
+    fallen: bool
+    fall_manager: bool
+    posture: str
+    walks: bool
+    pose: tuple[float, float, float]
+    twist: tuple[float, float, float]
+    battery_percent: float
+
+
+class TaskEnd(msgspec.Struct, frozen=True, tag="task"):
+    """A task has ended, with an error or with an empty text."""
+
+    task: int
+    error: str
+
+
+class Failure(msgspec.Struct, frozen=True, tag="failure"):
+    """The bridge ends."""
+
+    message: str
+
+
+class Connection:
+    """One bridge process; a lost one is replaced by a new object, so that no value outlives it.
+
+    Args:
+        settings: How to reach the robot.
+        device: Id of the device at its agent.
+
+    Attributes:
+        status: The newest status.
+        velocity_rad_s: From the last two measurements.
+
+    Raises:
+        UnreachableError: The bridge cannot be started, or the robot sends no valid values in time.
+    """
+
+    def __init__(self, settings: Settings, device: str) -> None:
+        self._where = settings.url
+        self._count = len(settings.joints)
+        self._decoder = msgspec.json.Decoder(Measurement | Status | TaskEnd | Failure)
+        self._ready = threading.Event()
+        self._closed = threading.Event()
+        self._failure = f"{self._where} sends no valid new values"
+        self._newest: Measurement | None = None
+        self._tasks: dict[int, str | None] = {}
+        self._task_changed = threading.Condition()
+        self.status: Status | None = None
+        self.velocity_rad_s = (0.0,) * self._count
+        self._link, theirs = socket.socketpair()
+        try:
+            # A new session, so that Ctrl-C in a terminal does not end the bridge before it has stopped the robot.
+            self._process = subprocess.Popen(  # noqa: S603 (the interpreter is named in the local configuration)
+                [settings.python, "-I", str(_BRIDGE)], stdin=theirs.fileno(), start_new_session=True
+            )
+        except OSError as error:
+            self._link.close()
+            raise UnreachableError(f"the Python of the NAOqi bridge cannot be started: {error}") from error
+        finally:
+            theirs.close()
+        self._link.settimeout(_CHECK_S)
+        self._thread = SupervisedThread(
+            self._receive, name=f"{device}-receiver", part="receiver of the driver", device=device
+        )
+        self._thread.start()
+        self.send(url=settings.url, joints=settings.joints, velocity_rad_s=settings.velocity_rad_s)
+        if not self._ready.wait(_START_S) or self._closed.is_set():
+            self.close()
+            raise UnreachableError(f"{self._failure}; check the robot's power, network and address")
+
+    @property
+    def measurement(self) -> Measurement:
+        """The newest valid measurement.
+
+        Raises:
+            UnreachableError: The connection has ended, or the values are old.
+        """
+        newest, status = self._newest, self.status
+        if self._closed.is_set() or newest is None or status is None:
+            raise UnreachableError(f"the connection to {self._where} is lost: {self._failure}")
+        if time.monotonic() - min(newest.at_s, status.at_s) > _OLD_S:
+            raise UnreachableError(f"{self._where} sends no valid new values")
+        return newest
+
+    def send(self, **command: Any) -> None:
+        """Send one command: ``angles``, ``twist``, ``hold``, ``stop_speech``, or a task. Never blocks.
+
+        Raises:
+            UnreachableError: The bridge has ended or hangs.
+        """
+        data = msgspec.json.encode(command) + b"\n"
+        try:
+            sent = self._link.send(data, socket.MSG_DONTWAIT)
+        except OSError as error:
+            self._closed.set()
+            raise UnreachableError(f"the NAOqi bridge has ended or hangs: {error}") from error
+        if sent < len(data):
+            self._closed.set()
+            raise UnreachableError("the NAOqi bridge hangs")
+
+    def start_task(self, **task: Any) -> int:
+        """Start a task that takes time; returns its number for ``wait_for``.
+
+        Raises:
+            UnreachableError: As for ``send``.
+        """
+        with self._task_changed:
+            number = len(self._tasks)
+            self._tasks[number] = None
+        self.send(task=number, **task)
+        return number
+
+    def wait_for(self, task: int, timeout_s: float) -> bool:
+        """Wait until a task has ended, at most ``timeout_s`` [s]; returns whether it has.
+
+        Raises:
+            SkillError: NAOqi has rejected it, or the connection is lost.
+        """
+        with self._task_changed:
+            self._task_changed.wait_for(lambda: self._tasks[task] is not None or self._closed.is_set(), timeout_s)
+            error = self._tasks[task]
+        if error is None and self._closed.is_set():
+            raise SkillError(f"the connection to {self._where} is lost")
+        if error:
+            raise SkillError(error)
+        return error is not None
+
+    def close(self) -> None:
+        """End the bridge, which stops the robot. May be called repeatedly."""
+        self._closed.set()
+        with contextlib.suppress(OSError):
+            self._link.shutdown(socket.SHUT_RDWR)
+        self._thread.join(_END_S)
+        self._link.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _receive(self) -> None:
+        buffer = b""
+        while not self._closed.is_set():
+            try:
+                received = self._link.recv(_MAX_LINE)
+            except TimeoutError:
+                continue
+            except OSError:
+                break
+            if not received or len(buffer) > _MAX_LINE:
+                break
+            *lines, buffer = (buffer + received).split(b"\n")
+            for line in lines:
+                with contextlib.suppress(msgspec.DecodeError):
+                    self._accept(self._decoder.decode(line))
+        self._closed.set()
+        self._ready.set()
+        with self._task_changed:
+            self._task_changed.notify_all()
+
+    def _accept(self, message: Measurement | Status | TaskEnd | Failure) -> None:
+        match message:
+            case Measurement():
+                self._accept_measurement(message)
+            case Status():
+                if {len(message.stiffness), len(message.temperature_c)} == {self._count}:
+                    self.status = message
+            case TaskEnd(task=task, error=error):
+                with self._task_changed:
+                    self._tasks[task] = error
+                    self._task_changed.notify_all()
+            case Failure(message=text):
+                self._failure = text
+                _log.warning("%s: %s", self._where, text)
+
+    def _accept_measurement(self, message: Measurement) -> None:
+        """Keep a measurement if its time of the robot is newer than the previous one. The first one may be old."""
+        previous = self._newest
+        if len(message.position_rad) != self._count or (previous and message.time_ms <= previous.time_ms):
+            return
+        if previous:
+            elapsed_s = (message.time_ms - previous.time_ms) / 1000
+            self.velocity_rad_s = tuple(
+                (new - old) / elapsed_s for new, old in zip(message.position_rad, previous.position_rad, strict=True)
+            )
+        self._newest = message
+        if previous and self.status:
+            self._ready.set()

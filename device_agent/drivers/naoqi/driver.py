@@ -1,0 +1,233 @@
+"""Driver of a NAO over NAOqi. ``device_agent/ports/driver.py`` documents each method."""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from device_agent.drivers.naoqi.connection import Connection, Settings, Status
+from device_agent.ports.driver import REST, DriverError, DriverFault, Observation, Twist, UnreachableError
+from device_agent.ports.skills import Skill, SkillContext, SkillError
+from device_agent.protocol import Say, SetStiffness, Twin
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.simulation.mjcf.robot_model import RobotModel
+
+LANGUAGES = {
+    "cs": "Czech", "de": "German", "en": "English", "es": "Spanish", "fr": "French", "it": "Italian",
+    "ja": "Japanese", "pl": "Polish", "pt": "Portuguese", "sk": "Slovak", "zh": "Chinese",
+}  # fmt: skip
+"""Language codes → NAOqi's names. The robot needs the language's package."""
+_LEG = ("Hip", "Knee", "Ankle")
+_LEG_RAD_S = 1.0
+"""Speed at which the legs return to the agent's command after a walk [rad/s]."""
+_STANDING = "Standing"
+_LIMP = 0.05
+"""A smaller share of the stiffness does not hold a joint."""
+_STILL = 1e-4
+"""A smaller twist [m/s, rad/s] counts as zero."""
+_POLL_S = 0.1
+_DELAY_S = 0.1
+"""Time until a command to walk is visible in the robot's status [s]."""
+
+
+class NaoqiDriver:
+    """Drives joints, walk, speech and stiffness of one NAO.
+
+    While the robot walks, NAOqi moves the legs: ``send`` returns their measured positions, and commands the others.
+
+    Args:
+        robot_type: Joints with NAOqi's names, limits and frames.
+        folder: Folder of the robot type, for its model.
+        url: Address of NAOqi.
+        python: Interpreter of the bridge.
+        device: Id of the device at its agent.
+    """
+
+    performs = ("speech", "stiffness")
+
+    def __init__(self, robot_type: RobotType, folder: Path, *, url: str, python: str, device: str) -> None:
+        joints = robot_type.joints
+        self._type = robot_type
+        self._names = tuple(joint.name for joint in joints)
+        self._settings = Settings(url, python, self._names, tuple(joint.max_velocity_rad_s for joint in joints))
+        self._legs = [index for index, name in enumerate(self._names) if name[1:].startswith(_LEG)]
+        self._model = RobotModel(robot_type, folder)
+        self._device = device
+        self._connection: Connection | None = None
+        self._halted = False
+        self._stiffness = dict.fromkeys(self._names, 1.0)
+        self._walked_s = -math.inf
+        self._legs_at: list[float] | None = None  # leg command while the legs return to the agent's
+
+    @property
+    def simulated(self) -> bool:
+        """Always False: this device is real."""
+        return False
+
+    def connect(self) -> None:
+        """Start the bridge, which stops the robot, and wait for the first measurement."""
+        self.close()
+        self._connection = Connection(self._settings, self._device)
+        self._walked_s, self._legs_at, self._halted = -math.inf, None, False
+
+    def twin(self) -> Twin | None:
+        """The model of the robot type; it needs no connection."""
+        return self._model.twin(self._device)
+
+    def observe(self) -> Observation:
+        """The newest measurement. NAOqi measures no torques: the efforts are 0."""
+        connection = self._connected()
+        newest = connection.measurement
+        return Observation(
+            newest.position_rad,
+            connection.velocity_rad_s,
+            (0.0,) * len(self._names),
+            self._model.frames(newest.position_rad),
+            at_s=newest.at_s,
+        )
+
+    def faults(self) -> tuple[DriverFault, ...]:
+        """A fall, limp joints that should hold, and a fall manager that is off."""
+        status = None if self._connection is None else self._connection.status
+        return () if status is None else self._faults(status)
+
+    def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
+        """Command positions within the limits of the joints; while the robot walks, not of the legs."""
+        connection, status = self._free()
+        if len(position_rad) != len(self._names):
+            raise DriverError(f"{len(position_rad)} positions for {len(self._names)} joints")
+        if not all(map(math.isfinite, position_rad)):
+            raise DriverError("a commanded position is not finite")
+        applied = [
+            min(max(value, joint.lower_rad), joint.upper_rad)
+            for value, joint in zip(position_rad, self._type.joints, strict=True)
+        ]
+        commands: list[float | None] = list(applied)
+        if self._walks(status):
+            self._legs_at = [connection.measurement.position_rad[index] for index in self._legs]
+            for index, measured in zip(self._legs, self._legs_at, strict=True):
+                applied[index], commands[index] = measured, None
+        elif self._legs_at is not None:
+            self._return_legs(self._legs_at, applied)
+            commands = list(applied)
+        connection.send(angles=commands)
+        return tuple(applied)
+
+    def drive(self, twist: Twist) -> Twist:
+        """Walk with a velocity within the limits of the base; a walk starts only while the robot stands."""
+        connection, status = self._free()
+        if not all(map(math.isfinite, twist)):
+            raise DriverError("a commanded twist is not finite")
+        base = self._type.base
+        if base is None:
+            raise DriverError(f"robot type '{self._type.type}' has no base")
+        limits = (base.max_linear_m_s, base.max_linear_m_s * base.sideways, base.max_angular_rad_s)
+        applied = Twist(*(min(max(value, -limit), limit) for value, limit in zip(twist, limits, strict=True)))
+        if max(map(abs, applied)) < _STILL or not (self._walks(status) or status.posture == _STANDING):
+            applied = REST
+        else:
+            self._walked_s = time.monotonic()
+        connection.send(twist=applied)
+        return applied
+
+    def report(self, stream: str) -> Mapping[str, float | bool]:
+        """``health``: battery and temperatures; ``odometry``: NAOqi's estimate of the pose and the velocity."""
+        status = None if self._connection is None else self._connection.status
+        if status is None:
+            return {}
+        if stream == "odometry":
+            names = ("x_m", "y_m", "yaw_rad", *Twist._fields)
+            return dict(zip(names, (*status.pose, *status.twist), strict=True))
+        if stream == "health":
+            temperatures = zip(self._names, status.temperature_c, strict=True)
+            health = {f"temperature_c.{joint}": value for joint, value in temperatures}
+            return {**health, "battery_percent": status.battery_percent}
+        return {}
+
+    def perform(self, skill: Skill, context: SkillContext) -> None:
+        """Speak, or set the stiffness of joints."""
+        try:
+            connection, _ = self._free()
+            match skill:
+                case Say(text=text, language=language):
+                    if language and language not in LANGUAGES:
+                        raise SkillError(f"no language '{language}'; there are: {', '.join(LANGUAGES)}")
+                    task = connection.start_task(say=text, language=LANGUAGES.get(language, ""))
+                case SetStiffness(value=value, joints=joints):
+                    self._stiffness.update(dict.fromkeys(joints or self._names, value))
+                    task = connection.start_task(stiffness=value, joints=joints or self._names)
+                case _:
+                    raise SkillError("NAOqi's driver only speaks and sets the stiffness")
+            while not connection.wait_for(task, _POLL_S):
+                if context.ended and isinstance(skill, Say):
+                    connection.send(stop_speech=True)
+                    return
+        except DriverError as error:
+            raise SkillError(str(error)) from error
+
+    def halt(self) -> None:
+        """End a walk and hold the measured position."""
+        self._halted = True
+        connection = self._connection
+        if connection is not None:
+            connection.send(hold=True)
+
+    def close(self) -> None:
+        """End the bridge, which stops the robot."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
+
+    def _connected(self) -> Connection:
+        if self._connection is None:
+            raise UnreachableError(f"'{self._device}' is not connected")
+        return self._connection
+
+    def _free(self) -> tuple[Connection, Status]:
+        """The connection and the robot's status, if it may move.
+
+        Raises:
+            DriverError: It is halted, lost, or has stopped itself.
+        """
+        connection = self._connected()
+        if self._halted:
+            raise DriverError("the robot was halted; it reconnects")
+        status = connection.status
+        if connection.measurement is None or status is None:
+            raise UnreachableError("the robot's status is unknown")
+        for fault in self._faults(status):
+            if fault.stops:
+                raise DriverError(f"the robot has stopped itself: {fault.message}")
+        return connection, status
+
+    def _faults(self, status: Status) -> tuple[DriverFault, ...]:
+        limp = [
+            name
+            for name, value in zip(self._names, status.stiffness, strict=True)
+            if value < min(_LIMP, self._stiffness[name])
+        ]
+        faults = []
+        if status.fallen:
+            faults.append(DriverFault("fallen", "the robot has fallen; set it upright"))
+        if limp:
+            message = f"{len(limp)} joints are limp ({limp[0]}); wake the robot up with its chest button"
+            faults.append(DriverFault("stiffness-off", message))
+        if not status.fall_manager:
+            message = "the fall manager is off: the robot does not protect itself when it falls"
+            faults.append(DriverFault("fall-manager-off", message, stops=False))
+        return tuple(faults)
+
+    def _walks(self, status: Status) -> bool:
+        """Whether NAOqi moves the legs: by its status, or a walk was commanded after it."""
+        return status.walks or status.at_s < self._walked_s + _DELAY_S
+
+    def _return_legs(self, legs_rad: Sequence[float], target: list[float]) -> None:
+        """Limit the step of the legs in ``target`` after a walk."""
+        step = _LEG_RAD_S * self._type.period_ms / 1000
+        stepped = [
+            now + min(max(target[index] - now, -step), step) for now, index in zip(legs_rad, self._legs, strict=True)
+        ]
+        arrived = stepped == [target[index] for index in self._legs]
+        for index, value in zip(self._legs, stepped, strict=True):
+            target[index] = value
+        self._legs_at = None if arrived else stepped

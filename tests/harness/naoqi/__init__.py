@@ -1,0 +1,1 @@
+"""NAOqi's services over the real protocol, for tests of its driver."""

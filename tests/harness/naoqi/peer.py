@@ -1,0 +1,84 @@
+"""A NAO for tests: the process that hosts NAOqi's services."""
+
+import json
+import subprocess
+import threading
+from pathlib import Path
+from typing import Any
+
+from device_agent.drivers.testing.peer import Disturbance
+from device_agent.ports.driver import Twist
+from device_agent.protocol.manifests.robot_type import RobotType
+
+_SERVICES = Path(__file__).with_name("services.py")
+
+
+class NaoPeer:
+    """The robot; it starts at home, standing and stiff.
+
+    Args:
+        robot_type: Joints and limits.
+        python: Interpreter that has ``qi``.
+    """
+
+    def __init__(self, robot_type: RobotType, python: Path) -> None:
+        self._names = [joint.name for joint in robot_type.joints]
+        self._lock = threading.Lock()
+        self.process = subprocess.Popen(
+            [python, "-I", _SERVICES], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        config = {
+            "joints": self._names,
+            "speeds": [joint.max_velocity_rad_s for joint in robot_type.joints],
+            "home": [robot_type.home_rad[name] for name in self._names],
+        }
+        self.url: str = self._exchange(config)
+
+    @property
+    def address(self) -> str:
+        """Host and port of NAOqi."""
+        return self.url.removeprefix("tcp://")
+
+    def state(self, **request: Any) -> dict[str, Any]:
+        """The robot's state, after an optional request."""
+        state: dict[str, Any] = self._exchange(request)
+        return state
+
+    def joint_positions(self) -> tuple[float, ...]:
+        """See ``Peer``."""
+        position = self.state()["position"]
+        return tuple(position[name] for name in self._names)
+
+    def joint_velocities(self) -> tuple[float, ...]:
+        """See ``Peer``."""
+        velocity = self.state()["velocity"]
+        return tuple(velocity[name] for name in self._names)
+
+    def base_twist(self) -> Twist:
+        """See ``Peer``."""
+        return Twist(*self.state()["twist"])
+
+    def disturb(self, disturbance: Disturbance) -> None:
+        """See ``Peer``."""
+        self.state(disturb=disturbance.value)
+
+    def restore(self) -> None:
+        """See ``Peer``."""
+        self.state(restore=True)
+
+    def close(self) -> None:
+        """Switch the robot off."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.close()
+        self.process.stdout.close()
+        self.process.kill()
+        self.process.wait()
+
+    def _exchange(self, request: Any) -> Any:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        with self._lock:
+            self.process.stdin.write(json.dumps(request) + "\n")
+            self.process.stdin.flush()
+            return json.loads(self.process.stdout.readline())
