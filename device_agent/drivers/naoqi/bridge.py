@@ -20,7 +20,7 @@ import qi
 import qi.logging
 
 WATCHDOG_S = 0.25
-"""Longest time between two commands while the robot walks [s]."""
+"""Longest time between two commands [s]."""
 _CHECK_S = 0.02
 _PERIOD_S = 0.02
 _STATUS_S = 0.1
@@ -36,21 +36,23 @@ _FALLEN = "robotHasFallen"
 class Robot:
     """The robot's services. Commands never wait for an answer, and at most one of each kind is outstanding."""
 
-    def __init__(self, url: str, joints: list[str], velocity_rad_s: list[float]) -> None:
+    def __init__(self, config: dict[str, Any]) -> None:
         self.session = qi.Session()
-        self.session.connect(url, _async=True).value(_CONNECT_MS)
+        self.session.connect(config["url"], _async=True).value(_CONNECT_MS)
         self.motion = self.service("ALMotion")
         self.memory = self.service("ALMemory")
         self.posture = self.service("ALRobotPosture")
         self.battery = self.service("ALBattery")
         self.speech = self.service("ALTextToSpeech")
-        self.joints = joints
+        self.joints: list[str] = config["joints"]
+        self.legs = set(config["legs"])
         self.language = str(call(self.speech.getLanguage))
-        limits = [call(self.motion.getLimits, joint)[0] for joint in joints]
-        shares = [limit / row[2] for limit, row in zip(velocity_rad_s, limits)]  # noqa: B905 (older Python)
+        limits = [call(self.motion.getLimits, joint)[0] for joint in self.joints]
+        shares = [limit / row[2] for limit, row in zip(config["velocity_rad_s"], limits)]  # noqa: B905 (older Python)
         self.fraction = min(1.0, *shares)
         self.walks = False
         self._walked_s = -math.inf
+        self._moved_s = math.inf
         self._held = False
         self._lock = threading.Lock()
         self._angles: Any = None
@@ -67,7 +69,10 @@ class Robot:
         """Move those joints that have an angle."""
         targets = {joint: angle for joint, angle in zip(self.joints, angles) if angle is not None}  # noqa: B905
         with self._lock:
-            if not self._held and not is_running(self._angles):
+            if self._held:
+                return
+            self._moved_s = time.monotonic()
+            if not is_running(self._angles):
                 self._set_angles(targets)
 
     def walk(self, twist: list[float]) -> None:
@@ -83,21 +88,21 @@ class Robot:
                 self._move = self.motion.move(*twist, _async=True)
 
     def check(self) -> None:
-        """Stop a walk without commands. Repeated until a stop that was sent after the last walk is confirmed."""
+        """Stop what is no longer commanded. Repeated until the robot has confirmed it."""
         with self._lock:
-            if self.walks and time.monotonic() - self._walked_s > WATCHDOG_S:
+            now_s = time.monotonic()
+            if self.walks and now_s - self._walked_s > WATCHDOG_S:
                 self._stop_walk()
+            if now_s - self._moved_s > WATCHDOG_S:
+                self._hold_joints()
 
     def hold(self, *, for_good: bool = False) -> None:
-        """Stop, and hold the measured angles. ``for_good``: reject all later commands."""
+        """Stop at once. ``for_good``: reject all later commands."""
         with self._lock:
             self._held = self._held or for_good
-            self.walks = True
+            self.walks, self._moved_s = True, -math.inf
             self._stop_walk()
-            try:
-                self._set_angles(dict(zip(self.joints, self.angles())))  # noqa: B905
-            except (RuntimeError, ValueError, TypeError):
-                return  # joints end at their last target, one period away
+            self._hold_joints()
 
     def end(self) -> None:
         """Hold, and wait until the robot has confirmed it."""
@@ -155,6 +160,19 @@ class Robot:
         """End all speech."""
         self.speech.stopAll(_async=True)
 
+    def _hold_joints(self) -> None:
+        """Command the measured angles. NAOqi itself ends a walk, so its legs are left alone."""
+        try:
+            if self._angles is not None:
+                self._angles.wait(_CALL_MS)  # services run calls in parallel; this one comes last
+            targets = dict(zip(self.joints, self.angles()))  # noqa: B905 (older Python)
+            if call(self.motion.moveIsActive):
+                targets = {joint: angle for joint, angle in targets.items() if joint not in self.legs}
+            self._set_angles(targets)
+            self._moved_s = math.inf
+        except (RuntimeError, ValueError, TypeError):
+            return  # the next check repeats it
+
     def _set_angles(self, targets: dict[str, float]) -> None:
         self._angles = self.motion.setAngles(list(targets), list(targets.values()), self.fraction, _async=True)
 
@@ -183,7 +201,7 @@ class Bridge:
         lines = self._link.makefile("rb")
         config = json.loads(lines.readline(_MAX_LINE))
         try:
-            robot = Robot(config["url"], config["joints"], config["velocity_rad_s"])
+            robot = Robot(config)
         except (RuntimeError, AttributeError, LookupError, TypeError) as error:
             self.send({"type": "failure", "message": str(error) or repr(error)})
             return

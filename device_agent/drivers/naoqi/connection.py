@@ -35,12 +35,14 @@ class Settings:
         python: Interpreter that has the package ``qi``.
         joints: NAOqi's names of the joints, in the order of all values.
         velocity_rad_s: Highest velocity of each joint [rad/s].
+        legs: Those joints that NAOqi moves when the robot walks.
     """
 
     url: str
     python: str
     joints: tuple[str, ...]
     velocity_rad_s: tuple[float, ...]
+    legs: tuple[str, ...]
 
 
 class Measurement(msgspec.Struct, frozen=True, tag="measurement"):
@@ -100,7 +102,7 @@ class Connection:
         self._decoder = msgspec.json.Decoder(Measurement | Status | TaskEnd | Failure)
         self._ready = threading.Event()
         self._closed = threading.Event()
-        self._failure = f"{self._where} sends no valid new values"
+        self._failure = "the NAOqi bridge has ended"
         self._newest: Measurement | None = None
         self._tasks: dict[int, str | None] = {}
         self._task_changed = threading.Condition()
@@ -122,10 +124,15 @@ class Connection:
             self._receive, name=f"{device}-receiver", part="receiver of the driver", device=device
         )
         self._thread.start()
-        self.send(url=settings.url, joints=settings.joints, velocity_rad_s=settings.velocity_rad_s)
-        if not self._ready.wait(_START_S) or self._closed.is_set():
+        self.send(url=settings.url, joints=settings.joints, velocity_rad_s=settings.velocity_rad_s, legs=settings.legs)
+        if not self._ready.wait(_START_S):
             self.close()
-            raise UnreachableError(f"{self._failure}; check the robot's power, network and address")
+            raise UnreachableError(f"{self._where} sends no valid new values; restart NAOqi")
+        if self._closed.is_set():
+            self.close()
+            raise UnreachableError(
+                f"{self._failure}; check the robot's power and address, and the package qi of {settings.python}"
+            )
 
     @property
     def measurement(self) -> Measurement:

@@ -49,8 +49,14 @@ class NaoqiDriver:
         joints = robot_type.joints
         self._type = robot_type
         self._names = tuple(joint.name for joint in joints)
-        self._settings = Settings(url, python, self._names, tuple(joint.max_velocity_rad_s for joint in joints))
         self._legs = [index for index, name in enumerate(self._names) if name[1:].startswith(_LEG)]
+        self._settings = Settings(
+            url=url,
+            python=python,
+            joints=self._names,
+            velocity_rad_s=tuple(joint.max_velocity_rad_s for joint in joints),
+            legs=tuple(self._names[index] for index in self._legs),
+        )
         self._model = RobotModel(robot_type, folder)
         self._device = device
         self._connection: Connection | None = None

@@ -28,7 +28,6 @@ class TestNaoqi(DriverContract):
 
     @pytest.fixture
     def driver(self, robot_type: RobotType, peer: NaoPeer) -> Iterator[Driver]:
-        options = {"address": peer.address, "python": str(NAOQI_PYTHON)}
-        driver = load("naoqi")(robot_type, ROBOTS / "nao", options, "nao")
+        driver = load("naoqi")(robot_type, ROBOTS / "nao", peer.options(), "nao")
         yield driver
         driver.close()

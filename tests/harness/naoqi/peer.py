@@ -24,6 +24,7 @@ class NaoPeer:
     def __init__(self, robot_type: RobotType, python: Path) -> None:
         self._names = [joint.name for joint in robot_type.joints]
         self._lock = threading.Lock()
+        self._python = python
         self.process = subprocess.Popen(
             [python, "-I", _SERVICES], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
@@ -34,10 +35,9 @@ class NaoPeer:
         }
         self.url: str = self._exchange(config)
 
-    @property
-    def address(self) -> str:
-        """Host and port of NAOqi."""
-        return self.url.removeprefix("tcp://")
+    def options(self) -> dict[str, str]:
+        """Options of a driver for this robot."""
+        return {"address": self.url.removeprefix("tcp://"), "python": str(self._python)}
 
     def state(self, **request: Any) -> dict[str, Any]:
         """The robot's state, after an optional request."""
