@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import signal
 import socket
 import sys
 import threading
@@ -27,6 +28,8 @@ _STATUS_S = 0.1
 _CALL_MS = 500
 _CONNECT_MS = 3000
 _END_S = 1.0
+_LAG_RAD = 0.1
+"""Largest distance of a joint that holds from its command [rad]."""
 _MAX_LINE = 65536
 _SENSOR = "Device/SubDeviceList/{}/{}/Value"
 _TIME = "DCM/Time"
@@ -114,9 +117,9 @@ class Robot:
                 if self.walks:
                     self._stop_walk()
 
-    def angles(self) -> list[float]:
-        """Measured angles [rad]."""
-        return numbers(call(self.motion.getAngles, self.joints, True), len(self.joints))
+    def angles(self, *, sensors: bool = True) -> list[float]:
+        """Measured angles [rad], or those that NAOqi commands now on the way to their targets."""
+        return numbers(call(self.motion.getAngles, self.joints, sensors), len(self.joints))
 
     def measurement(self) -> dict[str, Any]:
         """Joints and the robot's own time [ms]."""
@@ -161,11 +164,16 @@ class Robot:
         self.speech.stopAll(_async=True)
 
     def _hold_joints(self) -> None:
-        """Command the measured angles. NAOqi itself ends a walk, so its legs are left alone."""
+        """Keep the present command, which carries the load, or the measured angle where they differ much.
+
+        NAOqi itself ends a walk, so its legs are left alone.
+        """
         try:
             if self._angles is not None:
                 self._angles.wait(_CALL_MS)  # services run calls in parallel; this one comes last
-            targets = dict(zip(self.joints, self.angles()))  # noqa: B905 (older Python)
+            targets = {}
+            for joint, measured, command in zip(self.joints, self.angles(), self.angles(sensors=False)):  # noqa: B905
+                targets[joint] = command if abs(command - measured) < _LAG_RAD else measured
             if call(self.motion.moveIsActive):
                 targets = {joint: angle for joint, angle in targets.items() if joint not in self.legs}
             self._set_angles(targets)
@@ -284,5 +292,7 @@ def numbers(values: Any, count: int) -> list[float]:
 
 
 if __name__ == "__main__":
+    for ending in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(ending, signal.SIG_IGN)  # it ends after the agent, when it has stopped the robot
     Bridge(socket.socket(fileno=os.dup(0))).run()
     os._exit(0)  # the library's threads may hang

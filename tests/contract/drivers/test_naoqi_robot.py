@@ -123,6 +123,18 @@ def test_naoqi_moves_the_legs_of_a_walk_and_they_return_slowly(driver: NaoqiDriv
     assert max(after - before for before, after in itertools.pairwise(steps)) <= 0.0201
 
 
+def test_holding_keeps_a_command_near_the_measured_angle_and_gives_in_otherwise(
+    driver: NaoqiDriver, peer: NaoPeer
+) -> None:
+    position = peer.state()["position"]
+    commanded = {**position, "LKneePitch": position["LKneePitch"] + 0.05, "HeadYaw": position["HeadYaw"] + 0.5}
+    peer.state(set={"commanded": commanded})
+    driver.connect()
+    target = peer.state()["target"]
+    assert target["LKneePitch"] == pytest.approx(commanded["LKneePitch"])
+    assert target["HeadYaw"] == pytest.approx(position["HeadYaw"])
+
+
 def test_a_walk_starts_only_while_the_robot_stands(driver: NaoqiDriver, peer: NaoPeer) -> None:
     peer.state(set={"posture": "Sitting"})
     until(lambda: driver._connection and driver._connection.status and driver._connection.status.posture == "Sitting")

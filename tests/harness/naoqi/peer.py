@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,10 @@ from typing import Any
 from device_agent.drivers.testing.peer import Disturbance
 from device_agent.ports.driver import Twist
 from device_agent.protocol.manifests.robot_type import RobotType
+from tests.harness.paths import ROOT
 
 _SERVICES = Path(__file__).with_name("services.py")
+_SIMULATED = "tests.harness.naoqi.simulated_nao"
 
 
 class NaoPeer:
@@ -19,15 +22,17 @@ class NaoPeer:
     Args:
         robot_type: Joints and limits.
         python: Interpreter that has ``qi``.
+        simulated: Whether the joints are those of the simulation, instead of a simple model.
     """
 
-    def __init__(self, robot_type: RobotType, python: Path) -> None:
+    def __init__(self, robot_type: RobotType, python: Path, *, simulated: bool = False) -> None:
         self._names = [joint.name for joint in robot_type.joints]
         self._lock = threading.Lock()
         self._python = python
-        self.process = subprocess.Popen(
-            [python, "-I", _SERVICES], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        program: list[str | Path] = (
+            [sys.executable, "-m", _SIMULATED, _packages(python)] if simulated else [python, "-I", _SERVICES]
         )
+        self.process = subprocess.Popen(program, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         config = {
             "joints": self._names,
             "speeds": [joint.max_velocity_rad_s for joint in robot_type.joints],
@@ -82,3 +87,9 @@ class NaoPeer:
             self.process.stdin.write(json.dumps(request) + "\n")
             self.process.stdin.flush()
             return json.loads(self.process.stdout.readline())
+
+
+def _packages(python: Path) -> Path:
+    """Folder of the packages of a virtual environment, of the same Python version as this one."""
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    return python.parent.parent / "lib" / version / "site-packages"

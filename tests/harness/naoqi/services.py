@@ -26,9 +26,10 @@ class Body:
         self.joints, self.speeds = joints, dict(zip(joints, speeds, strict=True))
         self.position = dict(zip(joints, home, strict=True))
         self.target, self.fraction = dict(self.position), 1.0
+        self.commanded = self.position  # between position and target; this model follows it without a lag
         self.velocity = dict.fromkeys(joints, 0.0)
         self.stiffness = dict.fromkeys(joints, 1.0)
-        self.twist, self.pose = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+        self.walk, self.twist, self.pose = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
         self.fallen, self.fall_manager, self.posture = False, True, "Standing"
         self.spoken, self.calls, self.language = [], [], "English"
         self.speaking = threading.Event()
@@ -51,6 +52,7 @@ class Body:
             change = min(max(target - self.position[name], -limit), limit) if self.stiffness[name] else 0.0
             self.position[name] += change
             self.velocity[name] = change / elapsed_s
+        self.twist = list(self.walk)
         for index, value in enumerate(self.twist):
             self.pose[index] += value * elapsed_s
         if any(self.twist) or any(abs(value) > REST_RAD_S for value in self.velocity.values()):
@@ -59,7 +61,7 @@ class Body:
             self.rest_s = time.monotonic()
 
     def stop_itself(self):
-        self.twist, self.target, self.fallen = [0.0, 0.0, 0.0], dict(self.position), True
+        self.walk, self.target, self.fallen = [0.0, 0.0, 0.0], dict(self.position), True
         self.stiffness = dict.fromkeys(self.joints, 0.0)
 
     def command(self, name):
@@ -95,7 +97,7 @@ class ALMotion:
         if isinstance(names, str):
             names = self.body.joints
         with self.body.lock:
-            position = dict(self.body.position)
+            position = dict(self.body.position if use_sensors else self.body.commanded)
         return self.body.values(names, position)
 
     def setAngles(self, names, angles, fraction):
@@ -109,12 +111,12 @@ class ALMotion:
     def move(self, x, y, theta):
         with self.body.lock:
             if self.body.command("move"):
-                self.body.twist = [x, y, theta]
+                self.body.walk = [x, y, theta]
 
     def stopMove(self):
         with self.body.lock:
             self.body.command("stopMove")
-            self.body.twist = [0.0, 0.0, 0.0]
+            self.body.walk = [0.0, 0.0, 0.0]
 
     def moveIsActive(self):
         return any(self.body.twist)
@@ -219,7 +221,7 @@ class Nao:
         self.body.disturbance = kind
         if kind == "connection":
             with self.body.lock:
-                self.body.twist, self.body.target = [0.0, 0.0, 0.0], dict(self.body.position)
+                self.body.walk, self.body.target = [0.0, 0.0, 0.0], dict(self.body.position)
             self.session.close()
 
     def restore(self):
@@ -240,18 +242,29 @@ class Nao:
         with body.lock:
             for name, value in request.get("set", {}).items():
                 setattr(body, name, value)
-            state = ("position", "velocity", "twist", "rest_s", "stiffness", "fraction", "spoken", "calls", "language")
+            state = (
+                "position",
+                "target",
+                "velocity",
+                "twist",
+                "rest_s",
+                "stiffness",
+                "fraction",
+                "spoken",
+                "calls",
+                "language",
+            )
             return {name: getattr(body, name) for name in state}
 
 
-def main():
+def main(body):
     qi.logging.setLevel(qi.logging.FATAL)
     config = json.loads(sys.stdin.readline())
-    nao = Nao(Body(config["joints"], config["speeds"], config["home"]))
+    nao = Nao(body(config["joints"], config["speeds"], config["home"]))
     print(json.dumps(nao.url), flush=True)
     for line in sys.stdin:
         print(json.dumps(nao.answer(json.loads(line))), flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    main(Body)
