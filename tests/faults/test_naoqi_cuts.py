@@ -14,8 +14,8 @@ import pytest
 from device_agent.drivers.naoqi.driver import NaoqiDriver
 from device_agent.ports.driver import Twist
 from device_agent.protocol.manifests import robot_type
-from tests.harness.naoqi.peer import NaoPeer
 from tests.harness.paths import NAOQI_PYTHON, ROBOTS, ROOT
+from tests.harness.robots.naoqi.peer import NaoPeer
 
 NAO = robot_type.load(ROBOTS / "nao")
 LIMIT_S = 0.35

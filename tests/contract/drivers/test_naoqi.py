@@ -9,8 +9,8 @@ from device_agent.drivers.testing.driver_contract import DriverContract
 from device_agent.ports.driver import Driver
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
-from tests.harness.naoqi.peer import NaoPeer
 from tests.harness.paths import NAOQI_PYTHON, ROBOTS
+from tests.harness.robots.naoqi.peer import NaoPeer
 
 
 class TestNaoqi(DriverContract):

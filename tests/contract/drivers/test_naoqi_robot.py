@@ -16,8 +16,8 @@ from device_agent.ports.driver import REST, DriverError, Twist, UnreachableError
 from device_agent.ports.skills import SkillError
 from device_agent.protocol import RunBehaviour, Say, SetStiffness
 from device_agent.protocol.manifests import robot_type
-from tests.harness.naoqi.peer import NaoPeer
 from tests.harness.paths import NAOQI_PYTHON, ROBOTS
+from tests.harness.robots.naoqi.peer import NaoPeer
 
 NAO = robot_type.load(ROBOTS / "nao")
 NAMES = [joint.name for joint in NAO.joints]

@@ -11,7 +11,7 @@ from device_agent.ports.driver import Driver
 from device_agent.protocol.manifests import robot_type as robot_types
 from device_agent.protocol.manifests.robot_type import RobotType
 from tests.harness.paths import UR5
-from tests.harness.universal_robots.peer import UrPeer
+from tests.harness.robots.universal_robots.peer import UrPeer
 
 
 class TestUr(DriverContract):

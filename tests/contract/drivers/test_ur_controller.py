@@ -14,8 +14,8 @@ from device_agent.drivers.ur.driver import ORDER, Controller, UrDriver
 from device_agent.ports.driver import DriverError, UnreachableError
 from device_agent.protocol.manifests import robot_type as robot_types
 from tests.harness.paths import UR5
-from tests.harness.universal_robots import controller as emulated
-from tests.harness.universal_robots.peer import UrPeer
+from tests.harness.robots.universal_robots import controller as emulated
+from tests.harness.robots.universal_robots.peer import UrPeer
 
 TYPE = robot_types.load(UR5)
 HOME = tuple(TYPE.home_rad[name] for name in ORDER)

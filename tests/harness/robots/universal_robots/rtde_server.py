@@ -5,7 +5,7 @@ import struct
 from collections.abc import Sequence
 
 from device_agent.drivers.testing.peer import Disturbance
-from tests.harness.universal_robots.controller import CYCLE_S, JOINTS, Controller
+from tests.harness.robots.universal_robots.controller import CYCLE_S, JOINTS, Controller
 
 _TYPES = {"DOUBLE": "d", "VECTOR6D": "6d", "INT32": "i", "UINT32": "I"}
 _OUTPUT_TYPES = {

@@ -13,7 +13,7 @@ from device_agent.protocol.manifests.robot_type import RobotType
 from tests.harness.paths import ROOT
 
 _SERVICES = Path(__file__).with_name("services.py")
-_SIMULATED = "tests.harness.naoqi.simulated_nao"
+_SIMULATED = "tests.harness.robots.naoqi.simulated_nao"
 
 
 class NaoPeer:

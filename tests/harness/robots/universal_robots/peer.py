@@ -11,8 +11,8 @@ from device_agent.drivers.ur.driver import ORDER
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.threads import SupervisedThread
 from device_agent.protocol.manifests.robot_type import RobotType
-from tests.harness.universal_robots.controller import CYCLE_S, NORMAL, PROTECTIVE_STOP, Controller
-from tests.harness.universal_robots.rtde_server import RtdeServer, RtdeSession
+from tests.harness.robots.universal_robots.controller import CYCLE_S, NORMAL, PROTECTIVE_STOP, Controller
+from tests.harness.robots.universal_robots.rtde_server import RtdeServer, RtdeSession
 
 _WAIT_S = 60.0
 _STATE = b"\x00\x00\x00\x05\x10"

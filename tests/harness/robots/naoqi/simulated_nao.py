@@ -11,8 +11,8 @@ sys.path.append(sys.argv[1])
 from device_agent.drivers.mujoco import BipedDriver, create
 from device_agent.ports.driver import Twist
 from device_agent.protocol.manifests import robot_type
-from tests.harness.naoqi import services
 from tests.harness.paths import ROBOTS
+from tests.harness.robots.naoqi import services
 
 PERIOD_S = 0.02
 REST_RAD_S = 0.02

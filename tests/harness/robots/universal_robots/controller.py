@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from tests.harness.universal_robots import urscript
+from tests.harness.robots.universal_robots import urscript
 
 CYCLE_S = 0.008
 JOINTS = 6

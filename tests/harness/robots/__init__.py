@@ -1,0 +1,1 @@
+"""Emulated controllers of real robots, which speak the real protocols."""
