@@ -7,7 +7,7 @@ from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Api, Machine
 from tests.harness.browser.steering import open_robot
 
-TO = "Berta"
+TO = "berta"
 ROOM = "Annex"
 
 
