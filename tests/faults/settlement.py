@@ -130,7 +130,8 @@ class Settlement:
 
         wait_until(reached, f"the arm at {target_rad} rad", PATIENCE_S)
         self._trace.discard(self._trace.rows[-1].tick_ms)
-        with contextlib.closing(sqlite3.connect(f"file:{self._stack.home}/agent/journal.db?mode=ro", uri=True)) as file:
+        journal = self._stack.agent_home / "journal.db"
+        with contextlib.closing(sqlite3.connect(f"file:{journal}?mode=ro", uri=True)) as file:
             query = "SELECT terminal FROM commands WHERE id = ?"
             wait_until(lambda: file.execute(query, [action]).fetchone() == (1,), "the agent's last ack", PATIENCE_S)
         time.sleep(_SENT_S)

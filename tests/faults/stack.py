@@ -100,7 +100,7 @@ class Stack:
         self._environment = os.environ | {
             "TELESCOPE_HOME": str(self.home), "TELESCOPE_PORT": str(self.port), "TELESCOPE_BROKER": kind
         }  # fmt: skip
-        self._agent_home = ["--home", str(self.home / "agents" / "arms")]
+        self.agent_home = self.home / "agents" / "arms"
         self.trace = self.home / "trace"
         self._logs = self.home / "logs"
         self._logs.mkdir()
@@ -134,7 +134,7 @@ class Stack:
 
     def _start_agent(self) -> None:
         devices = [part for name in self.names for part in ("--device", f"{name}=ur5")]
-        home = self._agent_home
+        home = ["--home", str(self.agent_home)]
         output = self._program(
             "device_agent", "enroll", *home, "--server", f"http://{HOST}:{self.port}", "--name", "bench", *devices,
             "--no-wait",
@@ -149,7 +149,7 @@ class Stack:
 
     def agent_arguments(self, mqtt_port: int) -> list[str]:
         """Command line of the agent with this broker port."""
-        return [str(mqtt_port), str(self._watchdog_s), *self._agent_home, "--trace", str(self.trace)]
+        return [str(mqtt_port), str(self._watchdog_s), "--home", str(self.agent_home), "--trace", str(self.trace)]
 
     # ------------------------------------------------------------ operations
 
