@@ -31,12 +31,11 @@ from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
 from function_app.ports.device_feed import DeviceFeed, TelemetryFeed
-from function_app.ports.metrics import Metrics, NoMetrics
+from function_app.ports.monitoring import Metrics, NoMetrics, NoTracing, Tracing
 from function_app.ports.oidc_provider import OidcProvider
 from function_app.ports.password_hasher import PasswordHasher
 from function_app.ports.robot_catalogue import RobotCatalogue
 from function_app.ports.tables import StoreError, Tables
-from function_app.ports.tracing import NoTracing, Tracing
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, KeyVault, SecretsManager, Settings
 
 BLOBS_PATH = "/api/v1/blobs"

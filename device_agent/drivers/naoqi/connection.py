@@ -1,6 +1,7 @@
 """One connection to NAOqi through the bridge process, with JSON messages, one a line."""
 
 import contextlib
+import itertools
 import logging
 import socket
 import subprocess
@@ -104,6 +105,7 @@ class Connection:
         self._closed = threading.Event()
         self._failure = "the NAOqi bridge has ended"
         self._newest: Measurement | None = None
+        self._numbers = itertools.count()
         self._tasks: dict[int, str | None] = {}
         self._task_changed = threading.Condition()
         self.status: Status | None = None
@@ -149,7 +151,7 @@ class Connection:
         return newest
 
     def send(self, **command: Any) -> None:
-        """Send one command: ``angles``, ``twist``, ``hold``, ``stop_speech``, or a task. Never blocks.
+        """Send one command: ``angles``, ``twist``, ``hold``, or a task. Never blocks.
 
         Raises:
             UnreachableError: The bridge has ended or hangs.
@@ -170,8 +172,8 @@ class Connection:
         Raises:
             UnreachableError: As for ``send``.
         """
+        number = next(self._numbers)
         with self._task_changed:
-            number = len(self._tasks)
             self._tasks[number] = None
         self.send(task=number, **task)
         return number
@@ -185,11 +187,23 @@ class Connection:
         with self._task_changed:
             self._task_changed.wait_for(lambda: self._tasks[task] is not None or self._closed.is_set(), timeout_s)
             error = self._tasks[task]
+            if error is not None:
+                del self._tasks[task]
         if error is None and self._closed.is_set():
             raise SkillError(f"the connection to {self._where} is lost")
         if error:
             raise SkillError(error)
         return error is not None
+
+    def stop_speech(self, task: int) -> None:
+        """End a task that speaks, without waiting for its end.
+
+        Raises:
+            UnreachableError: As for ``send``.
+        """
+        with self._task_changed:
+            self._tasks.pop(task, None)
+        self.send(stop_speech=True)
 
     def close(self) -> None:
         """End the bridge, which stops the robot. May be called repeatedly."""
@@ -233,8 +247,9 @@ class Connection:
                     self.status = message
             case TaskEnd(task=task, error=error):
                 with self._task_changed:
-                    self._tasks[task] = error
-                    self._task_changed.notify_all()
+                    if task in self._tasks:
+                        self._tasks[task] = error
+                        self._task_changed.notify_all()
             case Failure(message=text):
                 self._failure = text
                 _log.warning("%s: %s", self._where, text)

@@ -5,6 +5,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from device_agent.drivers.command_limits import limit_positions, limit_twist
 from device_agent.drivers.naoqi.connection import Connection, Settings, Status
 from device_agent.ports.driver import REST, DriverError, DriverFault, Observation, Twist, UnreachableError
 from device_agent.ports.skills import Skill, SkillContext, SkillError
@@ -100,14 +101,7 @@ class NaoqiDriver:
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
         """Command positions within the limits of the joints; while the robot walks, not of the legs."""
         connection, status = self._free()
-        if len(position_rad) != len(self._names):
-            raise DriverError(f"{len(position_rad)} positions for {len(self._names)} joints")
-        if not all(map(math.isfinite, position_rad)):
-            raise DriverError("a commanded position is not finite")
-        applied = [
-            min(max(value, joint.lower_rad), joint.upper_rad)
-            for value, joint in zip(position_rad, self._type.joints, strict=True)
-        ]
+        applied = list(limit_positions(self._type, position_rad))
         commands: list[float | None] = list(applied)
         if self._walks(status):
             self._legs_at = [connection.measurement.position_rad[index] for index in self._legs]
@@ -122,13 +116,7 @@ class NaoqiDriver:
     def drive(self, twist: Twist) -> Twist:
         """Walk with a velocity within the limits of the base; a walk starts only while the robot stands."""
         connection, status = self._free()
-        if not all(map(math.isfinite, twist)):
-            raise DriverError("a commanded twist is not finite")
-        base = self._type.base
-        if base is None:
-            raise DriverError(f"robot type '{self._type.type}' has no base")
-        limits = (base.max_linear_m_s, base.max_linear_m_s * base.sideways, base.max_angular_rad_s)
-        applied = Twist(*(min(max(value, -limit), limit) for value, limit in zip(twist, limits, strict=True)))
+        applied = limit_twist(self._type, twist)
         if max(map(abs, applied)) < _STILL or not (self._walks(status) or status.posture == _STANDING):
             applied = REST
         else:
@@ -166,7 +154,7 @@ class NaoqiDriver:
                     raise SkillError("NAOqi's driver only speaks and sets the stiffness")
             while not connection.wait_for(task, _POLL_S):
                 if context.ended and isinstance(skill, Say):
-                    connection.send(stop_speech=True)
+                    connection.stop_speech(task)
                     return
         except DriverError as error:
             raise SkillError(str(error)) from error

@@ -1,12 +1,12 @@
 """Driver of one arm. ``device_agent/ports/driver.py`` documents each method."""
 
 import contextlib
-import math
 import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from device_agent.drivers.command_limits import limit_positions
 from device_agent.drivers.ur import modes, program
 from device_agent.drivers.ur.connection import Connection, Measurement
 from device_agent.drivers.ur.starter import ProgramStarter
@@ -124,14 +124,7 @@ class UrDriver:
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
         """Command positions within the limits of the joints."""
         connection = self._free()
-        if len(position_rad) != len(self._names):
-            raise DriverError(f"{len(position_rad)} positions for {len(self._names)} joints")
-        if not all(map(math.isfinite, position_rad)):
-            raise DriverError("a commanded position is not finite")
-        applied = tuple(
-            min(max(value, joint.lower_rad), joint.upper_rad)
-            for value, joint in zip(position_rad, self._type.joints, strict=True)
-        )
+        applied = limit_positions(self._type, position_rad)
         connection.command([applied[index] for index in self._to_controller])
         return applied
 

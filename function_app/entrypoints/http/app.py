@@ -55,7 +55,7 @@ from function_app.entrypoints.http.robot_types import (
 from function_app.entrypoints.http.sharing import routes as sharing
 from function_app.entrypoints.http.telemetry import blob_transfers, events, latency, series, uploads
 from function_app.ports.clock import Clock
-from function_app.ports.metrics import Histogram, Metrics
+from function_app.ports.monitoring import Histogram, Metrics
 from function_app.ports.tables import StoreError, StoreFullError
 from function_app.services.identity.rate_limiter import RateLimiter
 

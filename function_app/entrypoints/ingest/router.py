@@ -11,7 +11,7 @@ from device_agent.protocol.topics import Topic
 from function_app.bootstrap import Functions
 from function_app.domain.common.ids import device_id
 from function_app.domain.devices.devices import Transport
-from function_app.ports.metrics import Counter
+from function_app.ports.monitoring import Counter
 from function_app.services.telemetry.ingest import InboundMessage
 
 _MAX_LOGGED = 200

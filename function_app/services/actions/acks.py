@@ -14,8 +14,7 @@ from function_app.domain.common.ids import device_id, split_command
 from function_app.domain.common.json_depth import too_deep
 from function_app.domain.devices.devices import Transport
 from function_app.ports.clock import Clock
-from function_app.ports.metrics import Counter, Metrics
-from function_app.ports.tracing import Tracing
+from function_app.ports.monitoring import Counter, Metrics, Tracing
 from function_app.services.actions.action_store import ActionStore, StoredAction
 from function_app.services.actions.queue import ActionQueues
 from function_app.services.messaging.delivery import CONFIRMING

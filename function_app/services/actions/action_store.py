@@ -9,7 +9,7 @@ from function_app.domain.common.ids import split_command
 from function_app.domain.control.lease import release
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
-from function_app.ports.metrics import Histogram, Metrics
+from function_app.ports.monitoring import Histogram, Metrics
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.control.control_events import lease_change
 from function_app.services.devices.control_rows import ControlRows, read_control_rows

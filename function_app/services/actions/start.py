@@ -19,8 +19,8 @@ from function_app.domain.devices.devices import Device, Link
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.monitoring import Tracing
 from function_app.ports.tables import Row, Tables, Write
-from function_app.ports.tracing import Tracing
 from function_app.services.actions import capability_check
 from function_app.services.actions.acks import ActionAcks, Publication
 from function_app.services.actions.action_store import ActionStore, StoredAction, new_row

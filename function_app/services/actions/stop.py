@@ -21,7 +21,7 @@ from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
-from function_app.ports.metrics import Counter, Metrics
+from function_app.ports.monitoring import Counter, Metrics
 from function_app.ports.tables import StoreError
 from function_app.services.actions.queue import ActionQueues
 from function_app.services.control.control_events import ControlEvents

@@ -18,7 +18,7 @@ from function_app.domain.control.lease import Lease
 from function_app.domain.devices.devices import Agent, Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
-from function_app.ports.metrics import Counter, Metrics
+from function_app.ports.monitoring import Counter, Metrics
 from function_app.ports.tables import Row, StoreError, Tables, Write
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.devices.control_rows import read_control_rows

@@ -6,8 +6,8 @@ from function_app.domain.control.lease import Lease
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
+from function_app.ports.monitoring import Tracing
 from function_app.ports.tables import Tables
-from function_app.ports.tracing import Tracing
 from function_app.services.control.control_events import ControlEvents, lease_change
 from function_app.services.devices.control_rows import apply_device_epochs, read_control
 from function_app.services.storage import records

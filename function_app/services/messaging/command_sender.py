@@ -15,9 +15,8 @@ from function_app.domain.common.problems import broker_unavailable, invalid
 from function_app.domain.devices.devices import Device
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
-from function_app.ports.metrics import Counter, Metrics
+from function_app.ports.monitoring import Counter, Metrics, Tracing
 from function_app.ports.signing_keys import SigningKeys
-from function_app.ports.tracing import Tracing
 from function_app.services.messaging.delivery import Confirmation, Delivery, SignedCommand
 
 SHORT_TTL_MS = 5_000

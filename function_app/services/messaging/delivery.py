@@ -16,7 +16,7 @@ from typing import NamedTuple
 from device_agent.protocol import Ack, AckStatus, topics
 from function_app.domain.devices.devices import Device
 from function_app.ports.command_bus import CommandBus
-from function_app.ports.tracing import Tracing
+from function_app.ports.monitoring import Tracing
 from function_app.services.messaging.broker_relay import BrokerRelay
 from function_app.services.messaging.mailbox import Answer, Mailbox
 

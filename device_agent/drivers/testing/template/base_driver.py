@@ -1,12 +1,12 @@
 """Driver of a device that also has a mobile base, whose velocity continues until the next command."""
 
 import contextlib
-import math
 from pathlib import Path
 
+from device_agent.drivers.command_limits import limit_twist
 from device_agent.drivers.testing.template.driver import TemplateDriver
 from device_agent.drivers.watchdog import CommandWatchdog
-from device_agent.ports.driver import REST, DriverError, Twist, UnreachableError
+from device_agent.ports.driver import REST, Twist, UnreachableError
 from device_agent.protocol.manifests.robot_type import RobotType
 
 
@@ -26,13 +26,7 @@ class TemplateBaseDriver(TemplateDriver):
     def drive(self, twist: Twist) -> Twist:
         """Command a velocity within the limits of the base."""
         connection = self._free()
-        if not all(map(math.isfinite, twist)):
-            raise DriverError("a commanded twist is not finite")
-        base = self._type.base
-        if base is None:
-            raise DriverError(f"robot type '{self._type.type}' has no base")
-        limits = (base.max_linear_m_s, base.max_linear_m_s * base.sideways, base.max_angular_rad_s)
-        applied = Twist(*(min(max(value, -limit), limit) for value, limit in zip(twist, limits, strict=True)))
+        applied = limit_twist(self._type, twist)
         connection.send({"velocity": list(applied)})
         self._watchdog.feed()
         return applied

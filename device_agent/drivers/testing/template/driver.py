@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from device_agent.drivers.command_limits import limit_positions
 from device_agent.drivers.testing.template.connection import Connection
 from device_agent.ports.driver import DriverError, DriverFault, Observation, UnreachableError
 from device_agent.protocol import Twin
@@ -71,14 +72,7 @@ class TemplateDriver:
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
         """Command positions within the limits of the joints."""
         connection = self._free()
-        if len(position_rad) != len(self._names):
-            raise DriverError(f"{len(position_rad)} positions for {len(self._names)} joints")
-        if not all(map(math.isfinite, position_rad)):
-            raise DriverError("a commanded position is not finite")
-        applied = tuple(
-            min(max(value, joint.lower_rad), joint.upper_rad)
-            for value, joint in zip(position_rad, self._type.joints, strict=True)
-        )
+        applied = limit_positions(self._type, position_rad)
         connection.send({"names": self._names, "position_deg": [math.degrees(value) for value in applied]})
         return applied
 

@@ -16,7 +16,7 @@ from opentelemetry.trace import Span, SpanKind, Status, StatusCode
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
 from function_app import VERSION
-from function_app.ports.tracing import RemoteSpan
+from function_app.ports.monitoring import RemoteSpan
 
 _FLUSH_S = 1.0
 _PROPAGATOR = TraceContextTextMapPropagator()

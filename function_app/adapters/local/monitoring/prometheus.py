@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 import prometheus_client as prometheus
 from prometheus_client import CollectorRegistry
 
-from function_app.ports.metrics import Counter, Gauge, Histogram
+from function_app.ports.monitoring import Counter, Gauge, Histogram
 
 
 class PrometheusMetrics:

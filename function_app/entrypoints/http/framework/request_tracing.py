@@ -5,7 +5,7 @@ from typing import Final
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from device_agent.protocol.fields import trace_id
-from function_app.ports.tracing import Tracing
+from function_app.ports.monitoring import Tracing
 
 TRACE_ID: Final = "telescope.trace_id"
 """Key of the trace id in the scope of a traced request."""

@@ -10,7 +10,7 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem, unauthorized
 from function_app.domain.health.server_health import Status
 from function_app.entrypoints.http.framework.administration import has_metrics_token, is_local
-from function_app.ports.metrics import Gauge
+from function_app.ports.monitoring import Gauge
 from function_app.services.maintenance.readiness import Health
 
 _CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"

@@ -10,7 +10,7 @@ import pytest
 
 from function_app.adapters import factory
 from function_app.adapters.local.monitoring.otlp_tracing import OtlpTracing
-from function_app.ports.tracing import NoTracing
+from function_app.ports.monitoring import NoTracing
 from tests.fakes.tracing import CALLER, TRACE, TRACEPARENT
 from tests.harness.cloud.cloud import settings
 from tests.harness.hosts.host import environment_of

@@ -3,7 +3,7 @@ import urllib.request
 import pytest
 
 from function_app.adapters.local.monitoring.prometheus import PrometheusMetrics
-from function_app.ports.metrics import Counter, Histogram, NoMetrics
+from function_app.ports.monitoring import Counter, Histogram, NoMetrics
 from tests.harness.browser.product import free_ports
 
 

@@ -12,7 +12,7 @@ from device_agent.protocol import topics
 from function_app.adapters.local.clock import SystemClock
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Role
-from function_app.ports.tracing import NoTracing
+from function_app.ports.monitoring import NoTracing
 from function_app.services.messaging.delivery import Delivery, SignedCommand
 from function_app.services.messaging.mailbox import Mailbox
 from function_app.services.storage import records
