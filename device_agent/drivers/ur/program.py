@@ -36,6 +36,9 @@ def telescope():
   write_output_integer_register({RUNNING}, session)
   while read_input_integer_register({END}) != session:
     beat = beat + 1
+    if beat > 1000000:
+      beat = 0
+    end
     write_output_integer_register({BEAT}, beat)
     newest = read_input_integer_register({COUNTER})
     age = age + get_steptime()
