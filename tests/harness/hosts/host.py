@@ -79,17 +79,17 @@ def start_program(
 
 def cloud_python(cloud: str) -> str:
     """The interpreter of the version that a cloud runs, if this machine has it; otherwise this one."""
-    return interpreter(PYTHON[cloud]) or sys.executable
+    return interpreter(PYTHON[cloud])
 
 
-def interpreter(version: str) -> str | None:
-    """An interpreter of a version such as ``3.12``, if this machine has it."""
+def interpreter(version: str) -> str:
+    """An interpreter of a version such as ``3.12``, if this machine has it; otherwise this one."""
     installed = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     for candidate in (shutil.which(f"python{version}"), *installed.glob(f"{version}.*/bin/python")):
         # A shim of pyenv exists for versions that are not enabled; it fails.
         if candidate and subprocess.run([candidate, "-c", ""], capture_output=True, check=False).returncode == 0:
             return str(candidate)
-    return None
+    return sys.executable
 
 
 def isolated_path(package: Path, *programs: str) -> dict[str, str]:

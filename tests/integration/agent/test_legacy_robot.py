@@ -32,10 +32,7 @@ def processes(start_processes: Callable[[Any], CloudProcesses]) -> CloudProcesse
 
 @pytest.fixture(params=[OLDEST, NEW])
 def python(request: pytest.FixtureRequest) -> str:
-    found = interpreter(request.param)
-    if found is None:
-        pytest.skip(f"this machine has no Python {request.param}")
-    return found
+    return interpreter(request.param)
 
 
 @pytest.fixture
