@@ -21,7 +21,10 @@ export function StopBanner({ device, stop }: StopBannerProps) {
           ) : (
             <div>
               <strong>{texts.stop.outcomes[state.kind]}</strong>
-              {state.kind !== "sending" && <p>{state.repeating ? texts.stop.repeating : texts.stop.ended}</p>}
+              {state.kind === "fault" && <p>{texts.stop.faulty(newestFault(device))} {texts.stop.go}</p>}
+              {(state.kind === "sent" || state.kind === "unreachable") && (
+                <p>{state.repeating ? texts.stop.repeating : `${texts.stop.ended} ${texts.stop.go}`}</p>
+              )}
             </div>
           )}
           {error !== null && <p>{error}</p>}
@@ -30,6 +33,12 @@ export function StopBanner({ device, stop }: StopBannerProps) {
       {state.kind === "clear" && error !== null && <p class="notice bad">{error}</p>}
     </div>
   );
+}
+
+/** The message of the fault that was present last. */
+function newestFault(device: DeviceStore): string {
+  const faults = device.state.value?.faults ?? [];
+  return [...faults].sort((one, other) => (other.last_ms ?? 0) - (one.last_ms ?? 0))[0]?.message ?? "";
 }
 
 /** The outcome for each stopped robot, below a button that stops several. */

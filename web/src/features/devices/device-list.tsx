@@ -50,6 +50,7 @@ function RobotRow({ device, fleet, line }: { device: DeviceStore; fleet: Fleet; 
       <a class="device-name" href={deviceAddress(device.id)}>
         {info.label}
         <span class="quiet">
+          {info.name !== info.robot_type && `${info.name} · `}
           {info.robot_type} · {fleet.spaceName(info.space)}
         </span>
       </a>
@@ -116,7 +117,7 @@ function Activity({ device, line }: { device: DeviceStore; line: HealthSummary |
   const activity = state.action === null ? common.mode[state.mode] : texts.list.running(nameOf(state.action));
   return (
     <span class={device.live.value ? "" : "old"}>
-      <span class={state.mode === "stopped" || state.mode === "fault" ? "chip bad" : ""}>{activity}</span>
+      <span class={state.mode === "stopped" || state.mode === "fault" ? "chip bad" : ""}>{activity}</span>{" "}
       {faults > 0 && <span class="chip bad">{texts.list.faults(faults)}</span>}
     </span>
   );

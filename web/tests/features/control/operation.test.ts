@@ -86,9 +86,21 @@ describe("stop", () => {
     deliver("state", state(0, null, { mode: "idle", stop: latch }));
     expect(stop.state.value.kind).toBe("sent");
     deliver("state", state(0, null, { mode: "fault", stop: latch }));
-    expect(stop.state.value.kind).toBe("sent");
+    expect(stop.state.value.kind).toBe("fault");
     deliver("state", state(0, null, { mode: "stopped", stop: latch }));
     expect(stop.state.value.kind).toBe("latched");
+  });
+
+  it("of the robot itself is shown while its driver reports the cause", () => {
+    const latch = { caller: "the device", reason: "protective stop", at_ms: 1 };
+    const reported = (code: string): object => state(0, null, { mode: "fault", stop: latch, faults: [{ code, message: "x", since_ms: 1 }] });
+    deliver("state", reported("driver.protective-stop"));
+    deliver("tele/joints", telemetry({ mode: "fault" }));
+    expect(stop.state.value).toEqual({ kind: "latched", repeating: false });
+    deliver("state", reported("driver"));
+    expect(stop.state.value.kind).toBe("fault");
+    deliver("tele/joints", telemetry());
+    expect(stop.state.value.kind).toBe("clear");
   });
 
   it("is not sent for a viewer, and the page shows why", () => {

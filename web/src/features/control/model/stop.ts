@@ -17,9 +17,9 @@ const REPEAT_FOR_MS = 60_000;
 
 /**
  * `sending`: sent less than `CONFIRM_TIMEOUT_MS` ago. `sent`: not confirmed. `unreachable`: the agent is offline, or no
- * channel could send it. `latched`: the control loop of the robot has applied it.
+ * channel could send it. `fault`: latched, but the robot has a fault and confirms nothing. `latched`: the control loop of the robot has applied it.
  */
-export type StopKind = "clear" | "sending" | "sent" | "unreachable" | "latched";
+export type StopKind = "clear" | "sending" | "sent" | "unreachable" | "fault" | "latched";
 
 interface StopState {
   kind: StopKind;
@@ -29,7 +29,7 @@ interface StopState {
 
 interface Pressed {
   /** `latched`: the robot confirmed to the cloud; this page has not received the state yet. */
-  kind: Exclude<StopKind, "clear">;
+  kind: Exclude<StopKind, "clear" | "fault">;
   at: number;
   repeating: boolean;
 }
@@ -54,7 +54,9 @@ export class StopSwitch {
     const pressed = this.#pressed.value;
     if (pressed?.repeating === true) return { kind: pressed.kind, repeating: true };
     if (this.#device.stopped.value) return { kind: "latched", repeating: false };
-    return { kind: pressed?.kind ?? (this.#device.stopPending.value ? "sent" : "clear"), repeating: false };
+    if (pressed !== null) return { kind: pressed.kind, repeating: false };
+    const kind = this.#device.stopFaulty.value ? "fault" : this.#device.stopPending.value ? "sent" : "clear";
+    return { kind, repeating: false };
   });
 
   constructor(api: Api, device: DeviceStore, link: Link, author: string) {

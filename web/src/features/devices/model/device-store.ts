@@ -120,9 +120,15 @@ export class DeviceStore {
     const latest = this.#telemetry.value?.message;
     const state = this.#state.value;
     const newest = latest !== undefined && (state === null || latest.tick_ms >= state.tick_ms) ? latest : state;
-    if (newest?.mode === "stopped") return "applied";
-    if (state === null || newest !== state || (state.stop ?? null) === null) return "none";
-    return "pending";
+    const mode = newest?.mode;
+    if (mode === "stopped") return "applied";
+    if (state === null || (state.stop ?? null) === null) return "none";
+    // Newer telemetry in another mode may follow a reset. A device with a fault keeps the latch.
+    if (newest !== state && mode !== "fault") return "none";
+    if (mode !== "fault") return "pending";
+    // The agent observes a robot that has stopped itself, and sends it no commands.
+    const stoppedItself = state.faults.some(({ code }) => code.startsWith("driver."));
+    return stoppedItself && this.live.value ? "applied" : "faulty";
   });
 
   /** Whether the displayed state is current. */
@@ -134,11 +140,17 @@ export class DeviceStore {
   /** Active restrictions of its motion, as the device reports them. */
   readonly limited = computed(() => this.#telemetry.value?.message.limited.join(", ") ?? "");
 
-  /** Whether the control loop has applied Stop, according to the newest message. A faulty device cannot apply it. */
+  /**
+   * Whether the device has stopped, according to the newest message: its control loop has applied Stop, or it has stopped
+   * itself and is observed. Another fault prevents both.
+   */
   readonly stopped = computed(() => this.#stop.value === "applied");
 
   /** Whether Stop is latched, but the control loop has not applied it. */
   readonly stopPending = computed(() => this.#stop.value === "pending");
+
+  /** Whether Stop is latched, but the device has a fault, so that it cannot confirm that it is at rest. */
+  readonly stopFaulty = computed(() => this.#stop.value === "faulty");
 
   /**
    * The lease holder; `null`: none. The device enforces the lease that it has received, so its report takes precedence over the
