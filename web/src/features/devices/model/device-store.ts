@@ -230,9 +230,7 @@ export class DeviceStore {
   watchDetails(): () => void {
     this.#detailed.value = true;
     const end = this.#subscribe({
-      [this.topics.desc]: (payload, topic) => {
-        if (this.#isNew(topic, payload)) this.#description.value = readDescription(payload);
-      },
+      [this.topics.desc]: (payload, topic) => this.#applyDescription(payload, topic),
       [this.topics.twin]: (payload, topic) => {
         if (this.#isNew(topic, payload)) this.#twin.value = readTwin(payload);
       },
@@ -267,18 +265,14 @@ export class DeviceStore {
   /** Subscribes to the description only. Returns a function that unsubscribes. */
   watchDescription(): () => void {
     return this.#subscribe({
-      [this.topics.desc]: (payload, topic) => {
-        if (this.#isNew(topic, payload)) this.#description.value = readDescription(payload);
-      },
+      [this.topics.desc]: (payload, topic) => this.#applyDescription(payload, topic),
     });
   }
 
   /** Subscribes to the description and measurements, for a floor plan. Returns a function that unsubscribes. */
   watchMeasurements(): () => void {
     return this.#subscribe({
-      [this.topics.desc]: (payload, topic) => {
-        if (this.#isNew(topic, payload)) this.#description.value = readDescription(payload);
-      },
+      [this.topics.desc]: (payload, topic) => this.#applyDescription(payload, topic),
       [this.topics.tele]: (payload, topic) => {
         if (topic !== this.topics.joints) this.#applyMeasurements(topic, readMeasurements(payload));
       },
@@ -320,6 +314,10 @@ export class DeviceStore {
     return () => {
       for (const end of ends) end();
     };
+  }
+
+  #applyDescription(payload: Uint8Array, topic: string): void {
+    if (this.#isNew(topic, payload)) this.#description.value = readDescription(payload);
   }
 
   /** A new connection delivers retained messages again: unchanged ones must not trigger a redraw. */
