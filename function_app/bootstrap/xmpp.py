@@ -2,7 +2,9 @@
 
 from function_app.adapters import factory
 from function_app.adapters.local.command_feed import MqttCommandFeed
+from function_app.adapters.mqtt.connection import Broker, MqttConnection
 from function_app.bootstrap import Functions
+from function_app.ports.broker_link import Credentials, OnMessage, OpenLink
 from function_app.ports.command_feed import CommandFeed
 from function_app.ports.xmpp_connection import XmppConnection
 from function_app.settings import SettingsError
@@ -34,3 +36,19 @@ def command_feed(functions: Functions) -> CommandFeed:
     return MqttCommandFeed(
         host=settings.mqtt_host, port=settings.mqtt_port, access=functions.access, tls=factory.broker_tls(settings)
     )
+
+
+def broker_links(functions: Functions) -> OpenLink:
+    """Opens broker connections of operators."""
+    settings = functions.settings
+    tls = factory.broker_tls(settings)
+
+    def open_link(credentials: Credentials, receive: OnMessage) -> MqttConnection:
+        broker = Broker(host=settings.mqtt_host, port=settings.mqtt_port, credentials=credentials, tls=tls)
+        connection = MqttConnection(
+            broker, receive=lambda message: receive(message.topic, bytes(message.payload)), qos=1
+        )
+        connection.start()
+        return connection
+
+    return open_link

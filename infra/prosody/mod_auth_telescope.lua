@@ -173,7 +173,7 @@ local function is_allowed(session, stanza)
 	if session.telescope == CLOUD then return true; end
 	if user == nil then return stanza.name == "iq"; end
 	if stanza.name == "presence" then return (contacts[session.username] or {})[user] ~= nil; end
-	return session.telescope == "agent" and user == CLOUD and stanza.name == "message";
+	return user == CLOUD and stanza.name == "message";
 end
 
 module:hook("pre-stanza", function (event)

@@ -35,7 +35,7 @@ MAX_REASON = 400
 MAX_LISTEN = 64
 
 _ELEMENT = f"{{{NAMESPACE}}}m"
-_UNFIT = re.compile("[^\\t\\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+UNFIT = re.compile("[^\\t\\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that XML cannot represent, or normalizes (carriage return)."""
 _ID = re.compile(r"\A[A-Za-z0-9_.-]{1,64}\Z")
 
@@ -74,7 +74,7 @@ def message(
         stanza.set("id", receipt)
         SubElement(stanza, "request", {"xmlns": RECEIPTS})
     if body:
-        SubElement(stanza, "body").text = _UNFIT.sub("", body)
+        SubElement(stanza, "body").text = UNFIT.sub("", body)
     for pattern in listen:
         SubElement(stanza, "listen", {"xmlns": NAMESPACE, "topic": pattern})
     element = SubElement(stanza, "m", {"xmlns": NAMESPACE, "topic": topic})
@@ -98,7 +98,7 @@ def rejection(to: str, message_id: str, reason: str) -> str:
     error = SubElement(stanza, "error", {"type": "modify"})
     SubElement(error, "not-acceptable", {"xmlns": "urn:ietf:params:xml:ns:xmpp-stanzas"})
     text = SubElement(error, "text", {"xmlns": "urn:ietf:params:xml:ns:xmpp-stanzas"})
-    text.text = _UNFIT.sub("", reason[:MAX_REASON])
+    text.text = UNFIT.sub("", reason[:MAX_REASON])
     return tostring(stanza, encoding="unicode")
 
 
@@ -153,9 +153,14 @@ def parse(stanza: Element) -> Delivery | None:
         raise ProtocolError(f"the payload has {len(payload)} bytes; the limit is {codec.MAX_BYTES}")
     wants_receipt = stanza.find(f"{{{RECEIPTS}}}request") is not None
     message_id = stanza.get("id", "") if wants_receipt else ""
-    if message_id and not _ID.match(message_id):
+    if message_id and not is_message_id(message_id):
         raise ProtocolError("a message id has 1 to 64 letters, digits, _, . and -")
     return Delivery(topic, payload, message_id)
+
+
+def is_message_id(text: str) -> bool:
+    """Whether a text is valid as id of a message that gets a receipt or an answer."""
+    return _ID.match(text) is not None
 
 
 def requested_topics(stanza: Element) -> tuple[str, ...]:
@@ -194,6 +199,6 @@ def _plain(payload: bytes) -> str | None:
     except UnicodeDecodeError:
         return None
     escapes = 4 * (text.count("&") + text.count("<") + text.count(">")) + 5 * text.count('"')
-    if _UNFIT.search(text) or (escapes > len(payload) // 3 and len(payload) > MAX_STANZA_BYTES // 8):
+    if UNFIT.search(text) or (escapes > len(payload) // 3 and len(payload) > MAX_STANZA_BYTES // 8):
         return None
     return text

@@ -1,4 +1,4 @@
-"""The XMPP gateway: routes stanzas of agents to their sessions, and messages of the broker to agents.
+"""The XMPP gateway: routes stanzas of agents and operators to their sessions, and messages of the broker to agents.
 
 An agent starts a session with its presence message; the newest session number is valid. The sender of a message is the
 agent in the JID, which the XMPP server has authenticated.
@@ -9,6 +9,8 @@ import logging
 from collections.abc import Coroutine
 from xml.etree.ElementTree import Element
 
+import httpx
+
 from device_agent.protocol import Presence, State, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.xmpp import jids, stanzas
@@ -18,6 +20,8 @@ from function_app.domain.common.ids import AGENT_LENGTH
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent
 from function_app.entrypoints.xmpp.agent_session import AgentSession
+from function_app.entrypoints.xmpp.operators import Operators
+from function_app.ports.broker_link import OpenLink
 from function_app.ports.command_feed import CommandFeed
 from function_app.ports.tables import StoreError
 from function_app.ports.xmpp_connection import XmppConnection
@@ -35,12 +39,21 @@ _log = logging.getLogger(__name__)
 class XmppGateway:
     """Serves agents as the listener of an ``XmppConnection`` and of the broker's command feed."""
 
-    def __init__(self, functions: Functions, connection: XmppConnection, feed: CommandFeed) -> None:
+    def __init__(
+        self,
+        functions: Functions,
+        connection: XmppConnection,
+        feed: CommandFeed,
+        *,
+        api: httpx.AsyncClient,
+        open_link: OpenLink,
+    ) -> None:
         self._functions = functions
         self._connection = connection
         self._feed = feed
         self._sessions: dict[str, AgentSession] = {}
         self._viewers: dict[str, set[str]] = {}
+        self._operators = Operators(connection, api, open_link, self._start)
         self._tasks: set[asyncio.Task[None]] = set()
         self._measurements: list[InboundMessage] = []
         self._dropped = 0
@@ -67,8 +80,11 @@ class XmppGateway:
     def message(self, stanza: Element) -> None:
         """See ``Listener``."""
         jid = stanza.get("from", "")
-        user = self._agent_at(jid)
-        if user is None:
+        user, resource = stanzas.user_at(jid, self._connection.domain) or ("", "")
+        if not resource or user == jids.CLOUD:
+            return
+        if len(user) != AGENT_LENGTH:
+            self._operators.receive(jid, user, stanza)
             return
         try:
             delivery = stanzas.parse(stanza)
@@ -103,6 +119,7 @@ class XmppGateway:
         elif available and identity[1]:
             self._viewers.setdefault(user, set()).add(jid)
         else:
+            self._operators.left(jid)
             self._viewers.get(user, set()).discard(jid)
             if not self._viewers.get(user):
                 self._viewers.pop(user, None)
@@ -110,6 +127,7 @@ class XmppGateway:
     def lost(self) -> None:
         """See ``Listener``."""
         self._viewers.clear()
+        self._operators.lost()
         for session in self._sessions.values():
             session.close()
 
@@ -142,10 +160,6 @@ class XmppGateway:
             session.receive(session.delivery)
 
     # ------------------------------------------------------------ agents
-
-    def _agent_at(self, jid: str) -> str | None:
-        identity = stanzas.user_at(jid, self._connection.domain)
-        return identity[0] if identity is not None and identity[1] and len(identity[0]) == AGENT_LENGTH else None
 
     async def _start_session(
         self, user: str, jid: str, delivery: Delivery, presence: Presence, requested: tuple[str, ...]

@@ -3,8 +3,12 @@
 import asyncio
 import signal
 
+import httpx
+from starlette.types import ASGIApp
+
 from function_app.bootstrap import Functions
-from function_app.bootstrap.xmpp import command_feed, xmpp_connection
+from function_app.bootstrap.xmpp import broker_links, command_feed, xmpp_connection
+from function_app.entrypoints.http.app import create_app
 from function_app.entrypoints.xmpp.gateway import XmppGateway
 
 
@@ -20,7 +24,7 @@ async def run_gateway(functions: Functions) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopping.set)
     await functions.health.require_tables()
-    gateway = XmppGateway(functions, xmpp_connection(functions), command_feed(functions))
+    gateway = create_gateway(functions, create_app(functions))
     running = asyncio.create_task(gateway.run())
     waiting = asyncio.create_task(stopping.wait())
     done, _ = await asyncio.wait((running, waiting), return_when=asyncio.FIRST_COMPLETED)
@@ -29,3 +33,12 @@ async def run_gateway(functions: Functions) -> None:
     await asyncio.gather(running, waiting, return_exceptions=True)
     if running in done:
         running.result()
+
+
+def create_gateway(functions: Functions, app: ASGIApp) -> XmppGateway:
+    """The gateway; operators call ``app`` in this process."""
+    transport = httpx.ASGITransport(app, raise_app_exceptions=False)  # no timeout: the API limits waiting calls
+    api = httpx.AsyncClient(transport=transport, base_url=functions.settings.public_url)
+    return XmppGateway(
+        functions, xmpp_connection(functions), command_feed(functions), api=api, open_link=broker_links(functions)
+    )

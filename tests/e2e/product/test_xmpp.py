@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec, topics
@@ -94,6 +95,49 @@ def test_an_action_from_start_to_end_over_xmpp(api: Api, agent: Agent) -> None:
     assert nudge(api, device["id"], 0.1)["status"] == "done", (agent.home / "log").read_text()
     (transport,) = {each["transport"] for each in api.get("/agents")["items"] if each["id"] in device["id"]}
     assert transport == "xmpp"
+
+
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+
+
+def run_operator(machine: Machine, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    """``examples/xmpp_operator.py`` in a session of its own."""
+    link = machine.sign_in_link("demo").partition("#sign-in=")[2]
+    answer = httpx.post(f"{machine.url}/api/v1/auth/sign-in", json={"link": link})
+    token = answer.json()["access_token"]
+    return subprocess.run(
+        [sys.executable, str(ROOT / "examples" / "xmpp_operator.py"), *arguments],
+        env=os.environ | {"TELESCOPE_URL": machine.url, "TELESCOPE_TOKEN": token},
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("name", [NAME, "ur5"])
+def test_an_xmpp_client_moves_six_joints_and_shows_them(machine: Machine, api: Api, agent: Agent, name: str) -> None:
+    """Figures 4 and 6 of the UR5 paper, with a robot over XMPP and one over MQTT."""
+    device = api.device(name)
+    assert nudge(api, device["id"], 0.0)["status"] == "done", (agent.home / "log").read_text()
+    with streaming(api, device) as (_, seen):
+        start_rad = dict(zip(JOINTS, seen[-1].position_rad, strict=True))
+    target_rad = {joint: angle_rad + 0.1 for joint, angle_rad in start_rad.items()}
+    done = run_operator(machine, name, *(f"{joint}={angle}" for joint, angle in target_rad.items()))
+    assert done.returncode == 0, done.stdout + done.stderr
+    shown = dict(line.split() for line in done.stdout.partition("\n\n")[0].splitlines())
+    assert {joint: float(shown[joint]) for joint in JOINTS} == pytest.approx(target_rad, abs=0.03)
+    assert "rotation" in done.stdout
+
+
+def test_an_xmpp_client_without_control_moves_nothing(machine: Machine, api: Api, agent: Agent) -> None:
+    device = api.device(NAME)
+    assert nudge(api, device["id"], 0.0)["status"] == "done", (agent.home / "log").read_text()
+    with streaming(api, device) as (_, seen):  # another client has control
+        done = run_operator(machine, NAME, "wrist_3=1.0")
+        assert done.returncode == 1
+        assert "409" in done.stderr, done.stderr
+        assert max(abs(each.position_rad[5]) for each in seen) < 0.02
 
 
 @pytest.mark.long

@@ -21,8 +21,7 @@ import uvicorn
 
 from device_agent.protocol.xmpp.stream import Login, Stream
 from device_agent.transports.xmpp import XmppAccess, XmppTransport
-from function_app.bootstrap.xmpp import command_feed, xmpp_connection
-from function_app.entrypoints.xmpp.gateway import XmppGateway
+from function_app.entrypoints.xmpp.program import create_gateway
 from function_app.ports.broker_access import Credentials
 from function_app.settings import Settings, Xmpp
 from tests.fakes.agent import Robot
@@ -34,6 +33,8 @@ from tests.harness.paths import ROOT
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
+
+    from function_app.entrypoints.xmpp.gateway import XmppGateway
 
 DOMAIN = "telescope.localhost"
 
@@ -125,7 +126,7 @@ class Gateway:
         self.cloud = cloud
 
         async def start() -> "tuple[XmppGateway, asyncio.Task[None]]":
-            gateway = XmppGateway(cloud.functions, xmpp_connection(cloud.functions), command_feed(cloud.functions))
+            gateway = create_gateway(cloud.functions, cloud.app)
             return gateway, asyncio.create_task(gateway.run())
 
         self.gateway, self._task = cloud.run(start())

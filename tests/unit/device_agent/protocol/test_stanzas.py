@@ -24,7 +24,7 @@ def forwarded(stanza: str) -> Delivery | None:
 def test_any_payload_arrives_unchanged_in_valid_xml(payload: bytes, body: str) -> None:
     text = stanzas.message("a@b/c", TOPIC, payload, receipt="7", body=body)
     assert forwarded(text) == Delivery(TOPIC, payload, "7")
-    assert not stanzas._UNFIT.search(text + stanzas.rejection("a@b/c", "7", body))
+    assert not stanzas.UNFIT.search(text + stanzas.rejection("a@b/c", "7", body))
 
 
 @pytest.mark.parametrize("fill", [b"&", b'"', b"x", b"\xff", "🤖".encode()])
