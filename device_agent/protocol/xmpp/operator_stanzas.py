@@ -11,6 +11,7 @@ Each of them gets one answer with its id. A call is a request of the HTTP API; b
 the topics that an operator listens to, and setpoints, have the format of ``stanzas.message``.
 """
 
+import json
 from collections.abc import Iterable
 from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement, tostring
@@ -77,6 +78,11 @@ def listen(to: str, request_id: str, topics: Iterable[str]) -> str:
 def answer(to: str, request_id: str, status: int, body: str = "") -> str:
     """The answer to a request."""
     return _stanza(to, request_id, "answer", {"status": str(status)}, UNFIT.sub("", body))
+
+
+def problem(to: str, request_id: str, status: int, detail: str) -> str:
+    """An answer that rejects a request."""
+    return answer(to, request_id, status, json.dumps({"status": status, "detail": detail}, ensure_ascii=False))
 
 
 def parse_request(stanza: Element) -> SignIn | Call | Listen | None:

@@ -153,8 +153,7 @@ class OperatorSession:
         self._connection.send(operator_stanzas.answer(self.jid, request.id, 204))
 
     def _reject(self, request_id: str, status: int, detail: str) -> None:
-        problem = json.dumps({"status": status, "detail": detail}, ensure_ascii=False)
-        self._connection.send(operator_stanzas.answer(self.jid, request_id, status, problem))
+        self._connection.send(operator_stanzas.problem(self.jid, request_id, status, detail))
 
     async def _request(self, method: str, path: str, body: bytes, *, token: str = "") -> tuple[int, str]:
         """Status and body of a response of the HTTP API; a body that is not JSON is replaced by a problem."""

@@ -14,7 +14,9 @@ from function_app.ports.broker_link import OpenLink
 from function_app.ports.xmpp_connection import XmppConnection
 
 MAX_SESSIONS = 200
-"""Operators at one gateway; each needs two or more broker connections."""
+"""Operators at one gateway; each needs one broker connection, and one for each device under control."""
+MAX_OF_ACCOUNT = 8
+"""Sessions of one account at one gateway; a further sign-in ends the oldest."""
 _log = logging.getLogger(__name__)
 
 
@@ -44,9 +46,16 @@ class Operators:
             delivery = stanzas.parse(stanza) if request is None else None
             session = self._sessions.get(jid)
             if request is not None:
-                if session is None:
-                    session = self._open(jid, account, keep=isinstance(request, SignIn))
-                session.receive(request)
+                if session is None and isinstance(request, SignIn):
+                    session = self._open(jid, account)
+                if session is not None:
+                    session.receive(request)
+                else:
+                    busy = isinstance(request, SignIn)
+                    status, detail = (
+                        (503, "This gateway is full. Try again later.") if busy else (401, "Sign in first.")
+                    )
+                    self._connection.send(operator_stanzas.problem(jid, request.id, status, detail))
             elif delivery is not None and session is not None:
                 session.receive_setpoint(delivery)
         except ProtocolError as error:
@@ -65,10 +74,13 @@ class Operators:
         for jid in list(self._sessions):
             self.left(jid)
 
-    def _open(self, jid: str, account: str, *, keep: bool) -> OperatorSession:
+    def _open(self, jid: str, account: str) -> OperatorSession | None:
+        """A new session; ``None``: the gateway is full."""
+        own = [other for other in self._sessions if other.partition("@")[0] == account]
+        if len(own) >= MAX_OF_ACCOUNT:
+            self.left(own[0])
+        if len(self._sessions) >= MAX_SESSIONS:
+            return None
         session = OperatorSession(self._connection, self._api, self._open_link, jid=jid, account=account)
-        if keep:
-            while len(self._sessions) >= MAX_SESSIONS:
-                self.left(next(iter(self._sessions)))
-            self._sessions[jid] = session
+        self._sessions[jid] = session
         return session

@@ -115,7 +115,7 @@ def run_operator(machine: Machine, *arguments: str) -> "subprocess.CompletedProc
     )
 
 
-@pytest.mark.parametrize("name", [NAME, "ur5"])
+@pytest.mark.parametrize("name", [NAME, pytest.param("ur5", marks=pytest.mark.long)])
 def test_an_xmpp_client_moves_six_joints_and_shows_them(machine: Machine, api: Api, agent: Agent, name: str) -> None:
     """Figures 4 and 6 of the UR5 paper, with a robot over XMPP and one over MQTT."""
     device = api.device(name)

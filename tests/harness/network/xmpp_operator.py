@@ -18,11 +18,12 @@ class XmppOperator(XmppClient):
         site: The site.
         person: The account.
         token: Access token; default: the person's.
+        resource: Resource of the JID.
     """
 
-    def __init__(self, site: XmppSite, person: Person, *, token: str = "") -> None:
+    def __init__(self, site: XmppSite, person: Person, *, token: str = "", resource: str = "operator") -> None:
         issued = person.post("/xmpp/credentials", {"purpose": "view"}).json()
-        super().__init__(site.prosody.port, person.account, issued["password"], resource="operator")
+        super().__init__(site.prosody.port, person.account, issued["password"], resource=resource)
         assert self.opened, self.trouble
         self._numbers = itertools.count(1)
         self._token = token or person.token

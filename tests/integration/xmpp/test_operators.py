@@ -10,6 +10,7 @@ import pytest
 from device_agent.protocol import JointTarget, RunMovement, Setpoint, codec, topics
 from device_agent.protocol.security import setpoints
 from device_agent.protocol.xmpp import operator_stanzas, stanzas
+from function_app.entrypoints.xmpp import operators
 from tests.harness.cloud.cloud import Person
 from tests.harness.network.brokers import wait_until
 from tests.harness.network.xmpp import XmppRobot, XmppSite
@@ -147,6 +148,22 @@ def test_a_disconnected_operator_leaves_no_broker_connection(site: XmppSite, ann
         assert operator.sign_in().status == 204
         assert len(gateway._operators._sessions) == 1
     wait_until(lambda: not gateway._operators._sessions, "the end of the session")
+
+
+def test_the_number_of_sessions_is_limited_for_an_account_and_in_total(
+    site: XmppSite, anna: Person, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sessions = site.gateways[0].gateway._operators._sessions
+    wait_until(lambda: not sessions, "the end of earlier sessions")
+    monkeypatch.setattr(operators, "MAX_OF_ACCOUNT", 1)
+    monkeypatch.setattr(operators, "MAX_SESSIONS", 1)
+    with XmppOperator(site, anna, resource="first") as first, XmppOperator(site, anna, resource="second") as second:
+        assert first.sign_in().status == 204
+        assert second.sign_in().status == 204
+        assert first.call("GET", "/devices")[0] == 401
+        with XmppOperator(site, site.cloud.sign_in("bert")) as other:
+            assert other.sign_in().status == 503
+        assert second.call("GET", "/devices")[0] == 200
 
 
 def test_requests_and_answers_are_parsed_as_written() -> None:
