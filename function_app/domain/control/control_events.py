@@ -56,10 +56,8 @@ class ControlEvent:
         }
 
 
-def timed_out(lease: Lease | None, now_ms: int) -> Iterator[ControlEvent]:
+def timed_out(lease: Lease, now_ms: int) -> Iterator[ControlEvent]:
     """Transitions due to timeouts: an expired lease, an unanswered request."""
-    if lease is None:
-        return
     request = lease.request
     if request is not None and request.outcome == "open" and request.current_outcome(lease, now_ms) == "expired":
         yield _of_request(

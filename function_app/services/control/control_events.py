@@ -10,7 +10,7 @@ from collections.abc import AsyncGenerator, Iterable, Mapping
 from typing import Any, Final
 
 from function_app.domain.audit.hash_chain import CLOUD, Entry, Outcome
-from function_app.domain.common.ids import new_id, split_device
+from function_app.domain.common.ids import new_id
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import control_events
 from function_app.domain.control.control_events import ControlEvent, Fact
@@ -69,21 +69,20 @@ class ControlEvents:
         """Called by the timer: publish stored events and timeouts, and schedule the next check. Raises ``busy``."""
         await self._move(device)
         lease = (await read_control_rows(self._tables, device)).lease
+        if lease is None:
+            return
         now_ms = self._clock.now_ms()
-        pairing = lease.pairing if lease else ""
         timeouts = [fact.event(_name(device)) for fact in control_events.timed_out(lease, now_ms)]
         for event in timeouts:
-            await self._add(device, pairing, event)
+            await self._add(device, lease.pairing, event)
         if timeouts:
-            await self._audit_log.append_all(
-                await self._owner(device, pairing), [_entry(device, event, {}) for event in timeouts]
-            )
-        if lease is not None:
-            ends = [lease.expires_ms] if lease.is_live(now_ms) else []
-            if lease.request is not None and lease.request.current_outcome(lease, now_ms) == "open":
-                ends.append(lease.request.expires_ms)
-            if ends:
-                await self._reminders.schedule(f"{REMINDER}:{device}", min(ends))
+            owner = await self._owner(device, lease.pairing)
+            await self._audit_log.append_all(owner, [_entry(device, event, {}) for event in timeouts])
+        ends = [lease.expires_ms] if lease.is_live(now_ms) else []
+        if lease.request is not None and lease.request.current_outcome(lease, now_ms) == "open":
+            ends.append(lease.request.expires_ms)
+        if ends:
+            await self._reminders.schedule(f"{REMINDER}:{device}", min(ends))
 
     async def publish(self, device: str) -> None:
         """Move stored events to the device's events and the audit log. Under contention the timer does it later."""
@@ -110,8 +109,7 @@ class ControlEvents:
 
     async def _owner(self, device: str, pairing: str) -> str:
         """The account whose audit log contains the events of a pairing."""
-        agent_id, _ = split_device(device) or (device, "")
-        _, agent = await records.find(self._tables, records.AGENTS, agent_id, "agent", Agent)
+        _, agent = await records.find(self._tables, records.AGENTS, device.partition("-")[0], "agent", Agent)
         if agent is None:
             return CLOUD
         if agent.account is not None and pairing in {"", agent.pairing}:
@@ -213,4 +211,4 @@ def _by(caller: Identity | None) -> dict[str, str]:
 
 
 def _name(device: str) -> str:
-    return (split_device(device) or ("", device))[1]
+    return device.partition("-")[2]

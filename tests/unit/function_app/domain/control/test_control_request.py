@@ -41,6 +41,9 @@ def test_a_request_ends_with_its_time_or_its_lease() -> None:
     short = lease.renew(HELD, ANNA, epoch=1, lease_ms=5_000, now_ms=START)
     assert outcome(request_control(short), START + 5_000) == "ended"
     accepted = control_request.accept(requested, ANNA, request="r1", now_ms=START)
+    assert control_request.accept(accepted, ANNA, request="r1", now_ms=START) is accepted
+    rejected = control_request.reject(requested, ANNA, request="r1", now_ms=START)
+    assert control_request.reject(rejected, ANNA, request="r1", now_ms=START) is rejected
     with pytest.raises(Problem, match="requester has control"):
         control_request.withdraw(accepted, BERT, request="r1", now_ms=START)
 
@@ -81,7 +84,7 @@ def test_timeouts_are_recorded_with_the_next_change_and_their_own_time() -> None
     request_expired, lease_expired, _ = lease_changes(requested, taken, by="cleo", now_ms=late)
     assert (request_expired.at_ms, lease_expired.at_ms) == (START + 10_000, START + 60_000)
     assert list(timed_out(requested, late)) == [request_expired, lease_expired], "the timer creates the same event"
-    assert list(timed_out(None, late)) == list(timed_out(taken, late)) == []
+    assert list(timed_out(taken, late)) == []
     second = request_control(requested, CLEO, now_ms=START + 10_000, request="r2")
     assert facts_of(requested, second, START + 10_000) == [Fact.REQUEST_EXPIRED, Fact.REQUESTED]
 
