@@ -1,6 +1,8 @@
 """Requests for control have exactly one outcome, and every change causes its events."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import control_request, lease
 from function_app.domain.control.control_events import ControlEvent, Fact, control_ended, lease_changes, timed_out
-from function_app.domain.control.lease import Lease
+from function_app.domain.control.lease import ControlRequest, Lease
 from function_app.domain.identity.accounts import Identity
 
 ANNA, BERT, CLEO = (Identity(name[0], name, f"session of {name}") for name in ("anna", "bert", "cleo"))
@@ -46,6 +48,85 @@ def test_a_request_ends_with_its_time_or_its_lease() -> None:
     assert control_request.reject(rejected, ANNA, request="r1", now_ms=START) is rejected
     with pytest.raises(Problem, match="requester has control"):
         control_request.withdraw(accepted, BERT, request="r1", now_ms=START)
+
+
+def test_only_an_accepted_request_changes_the_holder() -> None:
+    requested = request_control(HELD)
+    sent = ControlRequest(
+        id="r1",
+        epoch=1,
+        account="b",
+        session="session of bert",
+        by="bert",
+        holder_account="a",
+        holder_session="session of anna",
+        requested_ms=START,
+        expires_ms=START + 10_000,
+        lease_ms=20_000,
+    )
+    assert requested == replace(HELD, request=sent)
+    assert request_control(requested) is requested
+    at: Any = {"request": "r1", "now_ms": START + 1}
+    rejected = control_request.reject(requested, ANNA, **at)
+    assert rejected == replace(HELD, request=replace(sent, outcome="rejected"))
+    withdrawn = control_request.withdraw(requested, BERT, **at)
+    assert withdrawn == replace(HELD, request=replace(sent, outcome="withdrawn"))
+    assert control_request.accept(requested, ANNA, **at) == Lease(
+        epoch=2,
+        account="b",
+        session="session of bert",
+        holder="bert",
+        expires_ms=START + 20_001,
+        lease_ms=20_000,
+        pairing="p",
+        request=replace(sent, outcome="accepted"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("current", "caller", "code", "extras"),
+    [
+        (None, BERT, "lease-free", {}),
+        (Lease(epoch=1), BERT, "lease-free", {}),
+        (HELD, ANNA, "lease-already-held", {"epoch": 1}),
+        (
+            request_control(HELD),
+            CLEO,
+            "lease-requested",
+            {"requester": "bert", "expires_at": "1970-01-01T00:16:50.000Z"},
+        ),
+    ],
+)
+def test_a_request_is_refused(current: Lease | None, caller: Identity, code: str, extras: dict[str, object]) -> None:
+    with pytest.raises(Problem) as problem:
+        request_control(current, caller)
+    assert (problem.value.code, problem.value.status, problem.value.extras) == (code, 409, extras)
+
+
+@pytest.mark.parametrize(
+    ("answer", "caller", "request_id", "code", "status"),
+    [
+        (control_request.accept, ANNA, "r2", "request-unknown", 404),
+        (control_request.accept, BERT, "r1", "forbidden", 403),
+        (control_request.reject, BERT, "r1", "forbidden", 403),
+        (control_request.withdraw, ANNA, "r1", "forbidden", 403),
+        (control_request.withdraw, BERT, "r2", "request-unknown", 404),
+    ],
+)
+def test_only_holder_and_requester_answer(
+    answer: Callable[..., Lease], caller: Identity, request_id: str, *, code: str, status: int
+) -> None:
+    with pytest.raises(Problem) as problem:
+        answer(request_control(HELD), caller, request=request_id, now_ms=START)
+    assert (problem.value.code, problem.value.status) == (code, status)
+
+
+@pytest.mark.parametrize("answer", [control_request.accept, control_request.reject])
+def test_an_expired_request_is_closed(answer: Callable[..., Lease]) -> None:
+    with pytest.raises(Problem) as problem:
+        answer(request_control(HELD), ANNA, request="r1", now_ms=START + 10_000)
+    assert (problem.value.code, problem.value.status) == ("control-request-closed", 409)
+    assert problem.value.extras == {"outcome": "expired"}
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from device_agent.protocol import GrantLease, ReleaseLease, RequestControl
+from function_app.services.control.control_events import CHECK_MS
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.fakes.broker import MemoryBroker
@@ -105,3 +106,36 @@ def test_a_takeover_closes_the_connection_of_the_former_holder_only(
         ).is_success
     control = sorted(grant.client_id for grant in broker.grants.values() if grant.client_id.startswith("c-"))
     assert control == [f"c-{robot.device}-2"]
+
+
+def test_the_timer_publishes_the_events_of_a_killed_process(
+    cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def killed(_: str) -> None:
+        """The process ends after the write of the lease."""
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cloud.functions.control_events, "publish", killed)
+        anna.take_lease(robot.device, lease_ms=600_000)
+    events = f"/devices/{robot.device}/events"
+    assert anna.get(events).json()["items"] == []
+    cloud.clock.advance(CHECK_MS / 1000)
+    cloud.sweep()
+    assert [item["kind"] for item in anna.get(events).json()["items"]] == ["control-taken"]
+
+
+def test_commands_name_the_person_who_caused_them(cloud: Cloud, anna: Person, bert: Person, robot: Robot) -> None:
+    share(anna, f"devices/{robot.device}", bert, "operator")
+    lease = f"/devices/{robot.device}/lease"
+    anna.take_lease(robot.device)
+    request = bert.post(f"{lease}/requests", {}).json()["request"]["id"]
+    anna.post(f"{lease}/requests/{request}/accept")
+    cloud.sign_in("anna").take_lease(robot.device, take_over=True, reason="now")
+    kinds = (GrantLease, RequestControl)
+    commands = [command for command in robot.commands if isinstance(command.request, kinds)]
+    assert [(type(command.request), command.caller, command.epoch) for command in commands] == [
+        (GrantLease, "anna", 1),
+        (RequestControl, "bert", 1),
+        (GrantLease, "anna", 2),
+        (GrantLease, "anna", 3),
+    ]

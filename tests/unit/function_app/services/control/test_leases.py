@@ -16,7 +16,11 @@ def test_a_lease_is_acquired_confirmed_renewed_and_released(anna: Person, robot:
     (grant,) = robot.received(GrantLease)
     assert isinstance(grant.request, GrantLease)
     pairing = grant.request.pairing
-    assert (grant.epoch, grant.request) == (1, GrantLease(holder="anna", lease_ms=5_000, pairing=pairing))
+    assert (grant.epoch, grant.caller, grant.request) == (
+        1,
+        "anna",
+        GrantLease(holder="anna", lease_ms=5_000, pairing=pairing),
+    )
     renewed = anna.take_lease(robot.device, epoch=1, lease_ms=60_000).json()
     assert (renewed["epoch"], renewed["confirmed"]) == (1, True)
     assert renewed["expires_at"] > acquired["expires_at"]
@@ -26,7 +30,7 @@ def test_a_lease_is_acquired_confirmed_renewed_and_released(anna: Person, robot:
     assert shown == {**expected, "reason": "", "request": None}
     assert anna.get(path).json() == {"lease": shown}
     assert anna.delete(f"{path}?epoch=1").status_code == 204
-    assert robot.received(ReleaseLease)[0].epoch == 1
+    assert [(command.epoch, command.caller) for command in robot.received(ReleaseLease)] == [(1, "anna")]
     assert anna.get(path).json() == {"lease": None}
     problem(anna.delete(f"{path}?epoch=1"), 409, "lease-lost")
     assert anna.post(path).json()["lease_ms"] == 30_000
