@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from function_app.domain.audit.hash_chain import CLOUD
+from function_app.domain.common.ids import new_id
 from function_app.domain.common.problems import Problem, busy_store, forbidden
 from function_app.domain.control.control_events import ControlEvent, Fact
 from function_app.domain.control.lease import ControlRequest, Lease
@@ -281,6 +282,7 @@ class TestDirectEvents:
         added = alone.run(recorder.add_event(DEVICE, Fact.TAKEN, TAKEN.message, data={"epoch": 7}))
         assert added == SHOWN | {"id": added["id"], "at_ms": alone.clock.now_ms()}
         assert events(alone) == [added]
+        assert len(added["id"]) == len(new_id())
         alone.run(recorder.add_event(DEVICE, Fact.SHARED, "text", severity="warning", data={}))
         assert sorted(event["severity"] for event in events(alone)) == ["info", "warning"]
         assert audited(alone, "owner") == []
@@ -306,6 +308,7 @@ class TestRejections:
         (event,) = events(alone)
         assert event["data"] == {"caller": "bert", "wanted": "stop", "code": "forbidden"}
         assert (event["kind"], event["severity"]) == ("command-rejected", "warning")
+        assert event["message"].endswith("Not you."), "it says why"
         (record,) = audited(alone, "owner")
         assert record.items() >= {"outcome": "rejected", "event": "command-rejected", **BY_BERT}.items()
 

@@ -218,6 +218,7 @@ def test_only_an_owner_takes_over_and_a_viewer_has_no_control(
         problem(request_control(other, robot), 403, "forbidden")
         for verb in ("accept", "reject"):
             problem(anna.post(f"{request}/{verb}"), 403, "forbidden")
+        problem(anna.delete(f"/devices/{robot.device}/lease?epoch=1"), 403, "forbidden")
         for path in ("stop", "stop/reset"):
             problem(other.post(f"/devices/{robot.device}/{path}"), 403, "forbidden")
         assert other.post("/stop").json() == {"items": []}

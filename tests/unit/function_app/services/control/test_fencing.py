@@ -6,11 +6,13 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import ReleaseLease
+from device_agent.protocol import Mode, ReleaseLease, State
 from function_app.domain.devices.devices import Device
+from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.fakes.broker import MemoryBroker
 from tests.harness.cloud.cloud import Cloud, Person
+from tests.harness.cloud.memory import Memory
 from tests.unit.function_app.services.sharing.shares import connected, share
 
 DEADLINE_S = 2.0
@@ -134,18 +136,37 @@ def test_there_is_nothing_to_repeat_without_a_lease_of_the_pairing(
     assert robot.received(ReleaseLease) == []
 
 
-def test_the_end_of_control_is_recorded_with_its_reason(
-    cloud: Cloud, anna: Person, robot: Robot, device: Device
+def test_the_end_of_control_is_recorded_for_the_owner(
+    cloud: Cloud, anna: Person, robot: Robot, memory: Memory, device: Device
 ) -> None:
     control = take_lease(anna, robot)
     assert revoke(cloud, device, account=anna.account)
+    epoch = control["epoch"] + 1
+    memory.tables.drop(records.AGENTS)  # the agent was deleted before the event is published
     cloud.run(cloud.functions.control_events.publish(robot.device))
-    event = anna.get(f"/devices/{robot.device}/events").json()["items"][0]
-    data = {"epoch": control["epoch"] + 1, "holder": "anna", "reason": "unshared"}
-    assert (event["kind"], event["data"]) == ("control-ended", data)
     (record, *_) = anna.get("/accounts/me/audit").json()["items"]
     assert (record["event"], record["target"]) == ("control-ended", robot.device)
-    assert anna.take_lease(robot.device).json()["epoch"] == control["epoch"] + 2
+    assert record["data"].items() >= {"epoch": epoch, "holder": "anna", "reason": "unshared"}.items()
+
+
+@pytest.mark.parametrize(("reported", "epoch"), [(1, 4), (3, 4), (20, 21)])
+def test_the_epoch_is_above_those_of_lease_and_device(  # noqa: PLR0917 (fixtures and parameters)
+    cloud: Cloud, anna: Person, robot: Robot, device: Device, reported: int, epoch: int
+) -> None:
+    for _ in range(3):
+        take_lease(anna, robot)
+    cloud.sign_in("anna").post(f"/devices/{robot.device}/lease/requests", {})
+    now_ms = cloud.clock.now_ms()
+    robot.publish_state(State(device="arm", at_ms=now_ms, tick_ms=1, mode=Mode.IDLE, epoch=reported, ended_epoch=0))
+    assert revoke(cloud, device)
+    assert [command.epoch for command in robot.received(ReleaseLease)] == [epoch]
+    assert anna.take_lease(robot.device).json()["epoch"] == epoch + 1
+
+
+def test_a_failed_cut_is_reported(cloud: Cloud, broker: MemoryBroker, device: Device) -> None:
+    for reachable in (True, False):
+        broker.reachable = reachable
+        assert cloud.run(cloud.functions.revocation.cut(device, 1)) is reachable
 
 
 def _of_pairing(device: Device, case: str) -> Device:
