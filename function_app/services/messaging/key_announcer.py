@@ -30,17 +30,14 @@ class KeyAnnouncer:
             StoreError: The keys cannot be read.
         """
         announcement = await self._keys.announcement()
-        is_overlap = announcement.signing != announcement.pins[-1].id
-        if not is_overlap or not announcement.statements:
+        if announcement.signing == announcement.pins[-1].id:
             return
         if announcement.serial != self._serial:
             self._serial = announcement.serial
             self._announced.clear()
         if agent.id in self._announced:
             return
-        target = next((each for each in devices_of(agent) if each.name == device), None)
-        if target is None:
-            return
+        target = next(each for each in devices_of(agent) if each.name == device)
         try:
             await self._command_sender.send(
                 target, RotateKey(statements=announcement.statements), caller=_CALLER, epoch=0

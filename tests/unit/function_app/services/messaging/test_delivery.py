@@ -19,6 +19,7 @@ from function_app.services.storage import records
 from function_app.services.storage.retention import Retention
 from tests.fakes.blobs import MemoryBlobs
 from tests.fakes.tables import MemoryTables
+from tests.unit.function_app.services.messaging.conftest import PolledMailbox
 
 ARM = Device(
     id="aaaaaaaaaa-arm", name="arm", label="Arm", kind="arm", robot_type="ur5", agent="aaaaaaaaaa", space="s",
@@ -50,6 +51,16 @@ def test_a_wait_ends_at_its_limit_during_a_concurrent_change() -> None:
     assert asyncio.run(confirmed(30)) is False
 
 
+def test_the_tables_are_read_after_growing_pauses_and_at_once_after_a_change(polled_mailbox: PolledMailbox) -> None:
+    unused: Any = None  # the agent polls
+    delivery = Delivery(bus=unused, mailbox=polled_mailbox, relay=unused, tracing=NoTracing())
+    expires_ms = polled_mailbox.clock.now_ms() + 5_000
+    signed = SignedCommand("aaaaaaaaaa-arm-00000000000000000000", b"{}", expires_ms)
+    polled_mailbox.change_at(0.55, ARM.agent)
+    polled_mailbox.loop.complete(delivery.send_confirmed(ARM, signed, wait_ms=1000))
+    assert polled_mailbox.read_s == [0.0, 0.02, 0.06, 0.14, 0.3, 0.5, 0.55, 0.75, 0.95]
+
+
 class Relay:
     """Records relayed messages."""
 
@@ -77,7 +88,8 @@ def test_each_transport_gets_commands_and_stops_in_its_own_way(
     tables, clock, relay, bus = MemoryTables(), SystemClock(), Relay(), Bus()
     retention = Retention(tables=tables, blobs=MemoryBlobs(now_s=time.time))
     mailbox = Mailbox(tables=tables, retention=retention, clock=clock)
-    delivery = Delivery(bus=cast("Any", bus), mailbox=mailbox, relay=cast("Any", relay), tracing=NoTracing())
+    used: Any = None if transport == "mqtt" else mailbox
+    delivery = Delivery(bus=cast("Any", bus), mailbox=used, relay=cast("Any", relay), tracing=NoTracing())
     device = replace(ARM, transport=transport)
     signed = SignedCommand("aaaaaaaaaa-arm-00000000000000000000", b"{}", clock.now_ms() + 5_000)
 

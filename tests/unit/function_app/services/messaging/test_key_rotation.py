@@ -6,10 +6,12 @@ import jwt
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from device_agent.protocol import AckStatus, Mode, RotateKey, RunMovement, State, codec
+from device_agent.protocol import AckStatus, Mode, RotateKey, RunMovement, State, codec, topics
 from device_agent.protocol.security import signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
+from function_app.entrypoints.ingest.router import ingest
 from tests.fakes.agent import Robot
+from tests.fakes.broker import MemoryBroker
 from tests.fixtures.cloud import OpenCloud
 from tests.harness.cloud.cloud import Cloud, Person
 from tests.unit.function_app.services.robot_types.movements import MINE, SOURCE
@@ -44,6 +46,15 @@ def run(person: Person, robot: Robot) -> None:
     assert started["status"] == "started", started
     robot.report(started["id"], AckStatus.DONE)
     assert person.action(started["id"], wait_ms=WAIT_MS, wait_for="done")["status"] == "done"
+
+
+def state(tick_ms: int) -> State:
+    return State(device="arm", mode=Mode.IDLE, epoch=0, at_ms=1, tick_ms=tick_ms)
+
+
+def publish_states(robot: Robot) -> None:
+    for tick_ms in range(3):
+        robot.publish_state(state(tick_ms))
 
 
 def test_a_session_continues_through_a_rotation(pair: Pair, cloud: Cloud, open_cloud: OpenCloud) -> None:
@@ -102,15 +113,36 @@ def test_tokens_of_a_leaked_key_are_rejected_in_all_instances(cloud: Cloud, open
 
 def test_a_new_key_is_announced_in_a_command_signed_with_the_old_key(pair: Pair, cloud: Cloud) -> None:
     _, robot = pair
+    publish_states(robot)
+    assert robot.received(RotateKey) == []
     new = rotate(cloud)
-    for tick in range(3):
-        robot.publish_state(State(device="arm", mode=Mode.IDLE, epoch=0, at_ms=tick, tick_ms=tick))
-    assert len(robot.received(RotateKey)) == 1
-    order = robot.received(RotateKey)[0].request
+    publish_states(robot)
+    (command,) = robot.received(RotateKey)
+    assert (command.epoch, command.caller) == (0, "telescope")
+    order = command.request
     assert isinstance(order, RotateKey)
     (statement,) = order.statements
     announcement = codec.decode(signing.verify(statement.encode(), robot._keys, context=KEYS_CONTEXT), NewKey)
     assert signing.key_id(signing.public_key(announcement.key)) == new
+
+
+def test_each_new_key_is_announced_once_until_it_signs_commands(pair: Pair, cloud: Cloud) -> None:
+    _, robot = pair
+    for number in (1, 2):
+        rotate(cloud)
+        publish_states(robot)
+        cloud.clock.advance(LEARN_S)
+        publish_states(robot)
+        assert len(robot.received(RotateKey)) == number
+        follow(robot)
+
+
+def test_an_announcement_that_failed_is_repeated(pair: Pair, cloud: Cloud, broker: MemoryBroker) -> None:
+    _, robot = pair
+    rotate(cloud)
+    for broker.reachable, number in ((False, 0), (True, 1), (True, 1)):
+        cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), codec.encode(state(number))))
+        assert len(robot.received(RotateKey)) == number
 
 
 def test_an_agent_claimed_during_an_overlap_pins_both_keys(cloud: Cloud) -> None:

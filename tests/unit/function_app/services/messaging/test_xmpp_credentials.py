@@ -3,8 +3,11 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import jwt
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
+from device_agent.protocol.security import signing
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
@@ -79,11 +82,26 @@ def test_an_account_is_admitted_with_its_xmpp_agents(
             store(cloud, replace(stored(each), transport="xmpp"))
         issued = passwords(cloud, anna, robot)["account"]
         assert (issued.user, issued.lifetime_s) == (anna.account, SESSION_S)
-        assert 0 < issued.expires_ms - cloud.clock.now_ms() <= SESSION_S * 1000
+        assert issued.expires_ms - cloud.clock.now_ms() == pytest.approx(SESSION_S * 1000, abs=1000)
         admitted = cloud.run(credentials.verify(anna.account, issued.password))
         assert (admitted.user, admitted.name, admitted.kind) == (anna.account, "anna", "account")
         assert admitted.contacts == (CLOUD_CONTACT, Contact(robot.id, stored(robot).name))
         assert admitted.lifetime_s == LOGIN_S
+
+
+def test_an_account_with_many_agents_gets_all_as_contacts(
+    cloud: Cloud, credentials: XmppCredentials, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = replace(stored(robot), transport="xmpp")
+    pages = {None: ([first], "1"), "1": ([replace(first, id="second")], None)}
+
+    async def agents(_: Identity, *, cursor: str | None, limit: int) -> tuple[list[Agent], str | None]:
+        assert limit > 0
+        return pages.pop(cursor)
+
+    monkeypatch.setattr(cloud.functions.devices, "agents", agents)
+    admitted = cloud.run(credentials.verify(anna.account, passwords(cloud, anna, robot)["account"].password))
+    assert [contact.user for contact in admitted.contacts] == ["cloud", robot.id, "second"]
 
 
 def test_the_gateway_is_admitted_without_contacts(
@@ -143,11 +161,51 @@ def test_passwords_expire(cloud: Cloud, credentials: XmppCredentials, anna: Pers
             cloud.run(credentials.verify(issued[user].user, issued[user].password))
 
 
+def test_a_password_is_valid_until_its_last_second(cloud: Cloud, credentials: XmppCredentials) -> None:
+    issued = cloud.run(credentials.cloud())
+    left_ms = issued.expires_ms - cloud.clock.now_ms()
+    cloud.clock.advance((left_ms - 2) / 1000)  # each call takes one millisecond
+    assert cloud.run(credentials.verify("cloud", issued.password)).lifetime_s == 1
+    with pytest.raises(Problem, match="wrong"):
+        cloud.run(credentials.verify("cloud", issued.password))
+
+
+def test_a_password_names_its_issuer_and_key(
+    cloud: Cloud, credentials: XmppCredentials, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only the key that it names is read, because the key may be new."""
+    password = cloud.run(credentials.cloud()).password
+    assert jwt.decode(password, options={"verify_signature": False})["iss"] == "telescope"
+    key = cloud.run(cloud.functions.keys.current()).public_key()
+
+    async def public(wanted: str = "") -> dict[str, Ed25519PublicKey]:
+        return {wanted: key} if wanted == signing.key_id(key) else {}
+
+    monkeypatch.setattr(cloud.functions.keys, "public", public)
+    assert cloud.run(credentials.verify("cloud", password)).kind == "cloud"
+
+
+@pytest.mark.parametrize("headers", [{}, {"kid": "unknown"}])
+def test_a_password_of_an_unknown_key_is_refused(
+    cloud: Cloud, credentials: XmppCredentials, headers: dict[str, str]
+) -> None:
+    claims = jwt.decode(cloud.run(credentials.cloud()).password, options={"verify_signature": False})
+    forged = jwt.encode(claims, signing.generate(), "EdDSA", headers=headers)
+    with pytest.raises(Problem, match="wrong"):
+        cloud.run(credentials.verify("cloud", forged))
+
+
 def test_without_a_server_nothing_is_issued_or_verified(open_cloud: OpenCloud) -> None:
     cloud = open_cloud()
     credentials = cloud.functions.xmpp_credentials
     anna = cloud.sign_in("anna")
-    for call in (credentials.cloud(), credentials.account(identity(anna)), credentials.verify("cloud", "x")):
+    agent = Agent(id="a", name="lab", public_key="", software="", devices=(), created_ms=0)
+    for call in (
+        credentials.agent(agent),
+        credentials.cloud(),
+        credentials.account(identity(anna)),
+        credentials.verify("cloud", "x"),
+    ):
         with pytest.raises(Problem) as problem:
             cloud.run(call)
         assert (problem.value.code, problem.value.status) == ("xmpp-unavailable", 409)
