@@ -128,10 +128,11 @@ def leased(geometry: RobotGeometry | None = None) -> ControllerFixture:
 
 @contextmanager
 def refuses(code: str) -> Iterator[None]:
-    """Expect a rejection with this code."""
+    """Expect a rejection with this code, and with a text for people."""
     with pytest.raises(Refused) as refused:
         yield
     assert refused.value.code == code
+    assert refused.value.message
 
 
 def ignore_revocation(_: Refused) -> None:

@@ -9,6 +9,7 @@ import pytest
 from device_agent.config.interlock_rule import InterlockRule
 from device_agent.protocol import Measurements
 from device_agent.protocol.events import EventKind
+from device_agent.runtime.authority.event_recorder import EventRecord
 from device_agent.runtime.authority.interlocks import Interlocks, engagement
 from device_agent.runtime.readings import Reading, ReadingCache
 
@@ -84,7 +85,8 @@ class InterlocksFixture:
     def __init__(self, *rules: InterlockRule) -> None:
         self.now_s = 10.0
         self.effects: list[tuple[Any, ...]] = []
-        self.recorded: list[Any] = []
+        self.recorded: list[EventRecord] = []
+        self.recorded_as: list[tuple[str, float]] = []
         self.sequence = 0
         named = [(each.device, each.stream) for each in rules]
         self.room = ReadingCache(space="lab", agent="own", own=["pir"], named=named, clock_s=lambda: self.now_s)
@@ -93,8 +95,12 @@ class InterlocksFixture:
             self.room,
             restrict=lambda *what: self.effects.append(what),
             lift=lambda name: self.effects.append((name,)),
-            record=lambda happened, *_: self.recorded.append(happened),
+            record=self.record,
         )
+
+    def record(self, event: EventRecord, key: str, now_s: float) -> None:
+        self.recorded.append(event)
+        self.recorded_as.append((key, now_s))
 
     def measure(self, **values: float | bool) -> None:
         self.sequence += 1
@@ -117,7 +123,7 @@ def test_an_interlock_without_a_reading_holds() -> None:
     assert fixture.step() == [(NAME, 0.0, "no measurement of pir/presence has arrived")]
     assert fixture.step(1.0) == [], "once"
     assert [happened.kind for happened in fixture.recorded] == [EventKind.INTERLOCK_ENGAGED]
-    assert "held" in fixture.recorded[0].message
+    assert "room held the" in fixture.recorded[0].message
 
 
 def test_presence_and_silence_slow_and_absence_clears() -> None:
@@ -137,8 +143,11 @@ def test_presence_and_silence_slow_and_absence_clears() -> None:
     assert kinds == [EventKind.INTERLOCK_ENGAGED, EventKind.INTERLOCK_CLEARED] * 2
     assert fixture.recorded[0].data == {"interlock": NAME, "action": "slow", "reason": "present = true"}
     assert fixture.recorded[0].severity == "warning"
-    assert "slowed" in fixture.recorded[0].message
+    assert "room slowed the" in fixture.recorded[0].message
     assert (fixture.recorded[1].severity, fixture.recorded[1].data) == ("info", {"interlock": NAME})
+    assert all(event.message for event in fixture.recorded)
+    keys = [f"{NAME} present = true", NAME, f"{NAME} pir/presence is silent", NAME]
+    assert fixture.recorded_as == list(zip(keys, [10.0, 10.0, 12.01, 12.01], strict=True))
 
 
 def test_rules_act_independently() -> None:
