@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from device_agent.runtime.storage import outbox_store as module
 from device_agent.runtime.storage.outbox_store import DroppedCount, OutboxItem, OutboxStore, OutboxStoreError
 
 OWN = "ts/v1/s/a/"
@@ -97,6 +98,42 @@ def test_beyond_the_bound_oldest_measurements_then_events_are_dropped_and_counte
     assert numbers(store) == []
     (count,) = dropped(store)
     assert count.events + len(events) == 2001, "all missing events, and the event that reported drops"
+
+
+SIZE = len(LATE) + 1 + 100
+"""Size of a message with one byte, as counted by the store [bytes]."""
+
+
+@pytest.mark.parametrize("chunk", [1, 2, 200])
+@pytest.mark.parametrize(
+    ("excess", "late", "events"),
+    [
+        (0, [2, 4], [1, 3, 5]),
+        (1, [4], [1, 3, 5]),
+        (SIZE, [4], [1, 3, 5]),
+        (SIZE + 1, [], [1, 3, 5]),
+        (2 * SIZE, [], [1, 3, 5]),
+        (2 * SIZE + 1, [], [3, 5]),
+        (4 * SIZE, [], [5]),
+    ],
+)
+def test_as_few_messages_as_needed_are_dropped(  # noqa: PLR0917 (fixtures and parameters)
+    open_store: OpenStore, monkeypatch: pytest.MonkeyPatch, chunk: int, excess: int, late: list[int], events: list[int]
+) -> None:
+    monkeypatch.setattr(module, "_CHUNK", chunk)
+    store = open_store(max_bytes=5 * SIZE - excess)
+    event = EVENT.ljust(len(LATE), "s")
+    store.put([item(number, event if number % 2 else LATE) for number in range(1, 6)], now_ms=NOW_MS)
+    assert (numbers(store), numbers(store, late=False)) == (late, events)
+    assert store.stored_bytes == SIZE * len(late + events)
+    if excess:
+        assert dropped(store) == [DroppedCount(OWN + "arm", measurements=2 - len(late), events=3 - len(events))]
+
+
+def test_the_last_message_is_dropped_if_it_is_too_long(open_store: OpenStore) -> None:
+    store = open_store(max_bytes=SIZE - 1)
+    store.put([item(1)], now_ms=NOW_MS)
+    assert numbers(store) == []
 
 
 def test_the_stored_size_is_always_correct(open_store: OpenStore) -> None:

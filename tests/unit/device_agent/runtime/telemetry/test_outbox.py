@@ -250,7 +250,29 @@ def test_an_event_from_memory_is_repeated_from_the_disk_once_it_is_stored(
     assert fixture.stored() == []
 
 
-def test_dropped_messages_are_reported_after_reconnection(fixture: OutboxFixture) -> None:
+def test_events_in_memory_and_on_disk_are_delivered_independently(
+    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fixture.connect()
+    fixture.acknowledges = False
+    fixture.event("stored")
+    fixture.iterate()
+    with monkeypatch.context() as patch:
+        patch.setattr(fixture.store, "put", fail)
+        fixture.event("first", "second")
+        fixture.iterate()
+        assert fixture.events() == ["stored", "first", "second"]
+        for acknowledge in fixture.open[1:]:
+            acknowledge()
+        fixture.iterate()
+    assert fixture.outbox._unsaved == {}
+    assert fixture.stored() == ["stored"]
+
+
+def test_dropped_messages_are_reported_after_reconnection(
+    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "wall_ms", lambda: 7_000)
     fixture.restart(max_bytes=50_000)
     fixture.measure(0, 2000)
     fixture.iterate()
@@ -259,7 +281,7 @@ def test_dropped_messages_are_reported_after_reconnection(fixture: OutboxFixture
     fixture.iterate()
     (report,) = fixture.reports(EventKind.BUFFER_DROPPED)
     assert report.data == {"measurements": 2000 - left, "events": 0}
-    assert (report.device, report.severity) == ("arm", "warning")
+    assert (report.device, report.severity, report.at_ms) == ("arm", "warning", 7_000)
 
 
 def test_a_stuck_thread_uses_bounded_memory_and_counts_drops(
@@ -286,6 +308,7 @@ def test_with_a_full_disk_events_are_sent_from_memory_and_one_event_reports_it(
     fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fixture.store, "put", fail)
+    monkeypatch.setattr(module, "wall_ms", lambda: 7_000)
     fixture.connect()
     fixture.event("held")
     fixture.iterate(2)
@@ -294,7 +317,7 @@ def test_with_a_full_disk_events_are_sent_from_memory_and_one_event_reports_it(
     fixture.iterate(40)
     assert fixture.events() == ["held", "next"]
     (report,) = fixture.reports(EventKind.BUFFER_FAILED)
-    assert report.severity == "error"
+    assert (report.severity, report.data, report.at_ms) == ("error", {"code": "disk"}, 7_000)
     assert "disk full" in report.message
 
 

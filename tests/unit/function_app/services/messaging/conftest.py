@@ -1,17 +1,27 @@
-"""A mailbox in virtual time that records when it is read."""
+"""An agent that polls, and a mailbox in virtual time that records when it is read."""
 
 import asyncio
 from collections.abc import Collection, Iterator
 
 import pytest
 
-from function_app.domain.devices.devices import Agent
+from function_app.domain.devices.devices import Agent, Device, DeviceSpec
+from function_app.domain.identity.accounts import Role
 from function_app.services.messaging.mailbox import Answer, Mailbox, MailboxEntry
 from function_app.services.storage.retention import Retention
 from tests.fakes.blobs import MemoryBlobs
 from tests.fakes.clock import MemoryClock
 from tests.fakes.event_loop import VirtualTimeLoop
 from tests.fakes.tables import MemoryTables
+
+AGENT = Agent(
+    id="aaaaaaaaaa", name="lab", public_key="", software="", devices=(DeviceSpec("arm", "arm", "ur5", "Arm"),),
+    created_ms=0, account="owner", space="s", pairing="p", transport="http",
+)  # fmt: skip
+ARM = Device(
+    id="aaaaaaaaaa-arm", name="arm", label="Arm", kind="arm", robot_type="ur5", agent=AGENT.id, space="s",
+    pairing="p", role=Role.OWNER, topic="ts/v1/s/aaaaaaaaaa/arm", transport="http",
+)  # fmt: skip
 
 
 class PolledMailbox(Mailbox):
@@ -25,8 +35,8 @@ class PolledMailbox(Mailbox):
         self.clock, self.tables = MemoryClock(), MemoryTables()
         self.loop = VirtualTimeLoop(self.clock)
         self.read_s: list[float] = []
-        retention = Retention(tables=self.tables, blobs=MemoryBlobs(now_s=lambda: self.clock.now_ms() / 1000))
-        super().__init__(tables=self.tables, retention=retention, clock=self.clock)
+        self.retention = Retention(tables=self.tables, blobs=MemoryBlobs(now_s=lambda: self.clock.now_ms() / 1000))
+        super().__init__(tables=self.tables, retention=self.retention, clock=self.clock)
 
     def change_at(self, time_s: float, agent: str) -> None:
         """Notify all callers that wait for this agent."""

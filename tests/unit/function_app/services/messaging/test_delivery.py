@@ -1,30 +1,24 @@
 """Commands and Stops by transport; waiting for an ack ends at its time limit, also during mailbox changes."""
 
 import asyncio
+import contextlib
 import time
-from collections.abc import Iterable
+from collections.abc import AsyncIterator, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, cast
 
 import pytest
 
-from device_agent.protocol import topics
+from device_agent.protocol import Ack, AckStatus, Reason, topics
 from function_app.adapters.local.clock import SystemClock
-from function_app.domain.devices.devices import Device
-from function_app.domain.identity.accounts import Role
 from function_app.ports.monitoring import NoTracing
-from function_app.services.messaging.delivery import Delivery, SignedCommand
+from function_app.services.messaging.delivery import Confirmation, Delivery, SignedCommand
 from function_app.services.messaging.mailbox import Mailbox
 from function_app.services.storage import records
 from function_app.services.storage.retention import Retention
 from tests.fakes.blobs import MemoryBlobs
 from tests.fakes.tables import MemoryTables
-from tests.unit.function_app.services.messaging.conftest import PolledMailbox
-
-ARM = Device(
-    id="aaaaaaaaaa-arm", name="arm", label="Arm", kind="arm", robot_type="ur5", agent="aaaaaaaaaa", space="s",
-    pairing="p", role=Role.OWNER, topic="ts/v1/s/aaaaaaaaaa/arm", transport="http",
-)  # fmt: skip
+from tests.unit.function_app.services.messaging.conftest import ARM, PolledMailbox
 
 
 class BusyMailbox(Mailbox):
@@ -59,6 +53,86 @@ def test_the_tables_are_read_after_growing_pauses_and_at_once_after_a_change(pol
     polled_mailbox.change_at(0.55, ARM.agent)
     polled_mailbox.loop.complete(delivery.send_confirmed(ARM, signed, wait_ms=1000))
     assert polled_mailbox.read_s == [0.0, 0.02, 0.06, 0.14, 0.3, 0.5, 0.55, 0.75, 0.95]
+
+
+class AckBus:
+    """A bus that receives these acks and then no more; ``None``: it receives none."""
+
+    def __init__(self, statuses: Sequence[AckStatus] | None) -> None:
+        self.statuses = statuses
+
+    async def publish(self, topic: str, payload: bytes) -> None:
+        del topic, payload
+
+    @contextlib.asynccontextmanager
+    async def acks(self, topic: str, command: str) -> AsyncIterator[AsyncIterator[Ack] | None]:
+        assert (topic, command) == (ARM.topic, SIGNED.command)
+        yield None if self.statuses is None else self._received()
+
+    async def _received(self) -> AsyncIterator[Ack]:
+        for status in self.statuses or ():
+            yield ack(status)
+        await asyncio.Event().wait()
+
+
+def ack(status: AckStatus) -> Ack:
+    reason = Reason(code="stale_epoch", message="", epoch=7) if status is AckStatus.FAILED else None
+    return Ack(id=SIGNED.command, status=status, sequence=1, at_ms=1, tick_ms=1, reason=reason)
+
+
+SIGNED = SignedCommand("aaaaaaaaaa-arm-00000000000000000000", b"{}", 2**45)
+RECEIVED, STARTED, FAILED, EXPIRED = AckStatus.RECEIVED, AckStatus.STARTED, AckStatus.FAILED, AckStatus.EXPIRED
+LATE = 1.0
+
+
+@pytest.mark.parametrize(
+    ("transport", "on_bus", "in_tables", "answer", "ends_s"),
+    [
+        ("mqtt", [RECEIVED, STARTED], None, Confirmation(confirmed=True), 0.0),
+        ("mqtt", [RECEIVED, FAILED], None, Confirmation(confirmed=False, device_epoch=7), 0.0),
+        ("mqtt", [EXPIRED, STARTED], None, Confirmation(confirmed=False), 0.0),
+        ("mqtt", [RECEIVED], STARTED, Confirmation(confirmed=False), LATE),
+        ("mqtt", None, STARTED, Confirmation(confirmed=True), 0.5),
+        ("xmpp", [STARTED], None, Confirmation(confirmed=True), 0.0),
+        ("xmpp", [RECEIVED], FAILED, Confirmation(confirmed=False, device_epoch=7), 0.5),
+        ("xmpp", [], None, Confirmation(confirmed=False), LATE),
+        ("http", [STARTED], None, Confirmation(confirmed=False), LATE),
+        ("http", [], STARTED, Confirmation(confirmed=True), 0.5),
+    ],
+)
+def test_the_first_decisive_ack_of_bus_and_tables_is_the_answer(  # noqa: PLR0917 (parameters)
+    polled_mailbox: PolledMailbox,
+    transport: Literal["mqtt", "xmpp", "http"],
+    on_bus: Sequence[AckStatus] | None,
+    in_tables: AckStatus | None,
+    answer: Confirmation,
+    ends_s: float,
+) -> None:
+    bus, relay = cast("Any", AckBus(on_bus)), cast("Any", Relay())
+    delivery = Delivery(bus=bus, mailbox=polled_mailbox, relay=relay, tracing=NoTracing())
+    loop = polled_mailbox.loop
+
+    async def store() -> None:
+        await asyncio.sleep(0.5)
+        if in_tables is not None:
+            await polled_mailbox.store_ack(ARM.agent, ack(in_tables))
+
+    task = loop.create_task(store())
+    device = replace(ARM, transport=transport)
+    assert loop.complete(delivery.send_confirmed(device, SIGNED, wait_ms=round(LATE * 1000))) == answer
+    assert loop.time() == pytest.approx(ends_s, abs=0.001)
+    loop.complete(asyncio.wait_for(task, 1))
+    assert asyncio.all_tasks(loop) == set()
+
+
+def test_without_a_wait_no_ack_is_expected(polled_mailbox: PolledMailbox) -> None:
+    delivery = Delivery(bus=cast("Any", None), mailbox=polled_mailbox, relay=cast("Any", None), tracing=NoTracing())
+    for wait_ms, rows in ((0, 1), (10, 2)):
+        polled_mailbox.loop.complete(delivery.send_confirmed(ARM, SIGNED, wait_ms=wait_ms))
+        assert len(polled_mailbox.tables.rows(records.MAILBOX)) == rows
+        assert all(
+            row.data["expires_ms"] == SIGNED.expires_ms for _, row in polled_mailbox.tables.rows(records.MAILBOX)
+        )
 
 
 class Relay:

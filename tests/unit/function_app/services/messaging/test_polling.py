@@ -7,20 +7,10 @@ from typing import Any
 import pytest
 
 from function_app.domain.common.problems import Problem
-from function_app.domain.devices.devices import Agent, Device, DeviceSpec, Link
-from function_app.domain.identity.accounts import Role
+from function_app.domain.devices.devices import Agent, Link
 from function_app.services.messaging.polling import CommandPolling
 from function_app.services.storage import records
-from tests.unit.function_app.services.messaging.conftest import PolledMailbox
-
-AGENT = Agent(
-    id="aaaaaaaaaa", name="lab", public_key="", software="", devices=(DeviceSpec("arm", "arm", "ur5", "Arm"),),
-    created_ms=0, account="owner", space="s", pairing="p", transport="http",
-)  # fmt: skip
-ARM = Device(
-    id="aaaaaaaaaa-arm", name="arm", label="Arm", kind="arm", robot_type="ur5", agent=AGENT.id, space="s",
-    pairing="p", role=Role.OWNER, topic="ts/v1/s/aaaaaaaaaa/arm", transport="http",
-)  # fmt: skip
+from tests.unit.function_app.services.messaging.conftest import AGENT, ARM, PolledMailbox
 
 
 @pytest.fixture
