@@ -50,6 +50,7 @@ class Fixture:
         assert authority.changed.is_set()
         assert authority.reservation is None
         assert [why.code for why in self.holds] == [why.code for why in self.revocations] == [code]
+        assert self.holds[0].message
         lost = self.event(EventKind.ACTION_LOST)
         assert (lost.severity, lost.data) == ("warning", {"code": code, "epoch": 3})
         assert self.event(EventKind.LEASE_ENDED).data == {"epoch": 3, "holder": "ann", "code": code}
@@ -65,7 +66,7 @@ class Fixture:
         (lambda authority: authority.release(3), "lease_lost"),
         (lambda authority: authority.expire(10.0), "lease_lost"),
         (lambda authority: authority.set_fault("no answer"), "fault"),
-        (lambda authority: authority.end_input(Refused("too_old", "")), "too_old"),
+        (lambda authority: authority.end_input(Refused("too_old", "late")), "too_old"),
     ],
     ids=["stop", "reset", "release", "expiry", "fault", "watchdog"],
 )

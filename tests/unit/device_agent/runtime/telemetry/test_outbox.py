@@ -1,88 +1,17 @@
 """Outbox: no event is lost, callers never wait, and live messages have priority."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
-from unittest import mock
 
 import pytest
 
-from device_agent.protocol import Event, codec
 from device_agent.protocol.events import EventKind
-from device_agent.runtime.storage.outbox_store import OutboxStore, OutboxStoreError
 from device_agent.runtime.telemetry import outbox as module
-from device_agent.runtime.telemetry.outbox import BUSY_RATE_HZ, RATE_HZ, Outbox
+from device_agent.runtime.telemetry.outbox import BUSY_RATE_HZ, RATE_HZ
 from tests.harness.agent.device_harness import WITHIN_S, eventually
-
-ARM = "ts/v1/s/a/arm"
-LATE = ARM + "/late/joints"
-
-
-class OutboxFixture:
-    """An outbox on a manual clock, and a link whose acceptance and acknowledgements the test controls."""
-
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / "outbox.db"
-        self.accepts = self.acknowledges = self.quiet = True
-        self.sent: list[tuple[str, bytes]] = []
-        self.open: list[Callable[[], None]] = []
-        self.now_s = 1000.0
-        self.restart()
-
-    def restart(self, max_bytes: int = 10**6) -> None:
-        self.store = OutboxStore(self.path, own="ts/v1/s/a/", max_bytes=max_bytes, max_age_ms=10**15)
-        self.outbox = Outbox(
-            self.store, publish=self.publish, device_topic=ARM, is_quiet=lambda: self.quiet, keep_hz=1.0
-        )
-
-    def publish(self, topic: str, payload: bytes, *, qos: int, delivered: Callable[[], None]) -> bool:
-        assert qos == 1
-        if not self.accepts:
-            return False
-        self.sent.append((topic, payload))
-        if self.acknowledges:
-            delivered()
-        else:
-            self.open.append(delivered)
-        return True
-
-    def acknowledge(self) -> None:
-        while self.open:
-            self.open.pop(0)()
-
-    def connect(self) -> None:
-        self.outbox.link_changed(True)
-
-    def iterate(self, count: int = 1, step_s: float = 0.25) -> None:
-        for _ in range(count):
-            self.now_s += step_s
-            self.outbox._iterate(self.now_s)
-
-    def iterate_for(self, seconds: float) -> None:
-        self.iterate(int(4 * seconds))
-
-    def event(self, *names: str) -> None:
-        for name in names:
-            self.outbox.add_event(ARM + "/event", name.encode(), at_ms=1)
-
-    def measure(self, first: int, last: int, *, sent: bool = False, each_s: float = 1.0) -> None:
-        for number in range(first, last):
-            self.now_s += each_s
-            self.outbox.add_measurement(LATE, str(number).encode(), at_ms=number, sent=sent, now_s=self.now_s)
-
-    def stored(self, *, late: bool = False) -> list[str]:
-        return [item.payload.decode() for _, item in self.store.after(0, late=late, limit=10**6)]
-
-    def events(self) -> list[str]:
-        """The events that were sent, except those of the outbox."""
-        return [payload.decode() for topic, payload in self.sent if topic.endswith("/event") and payload[:1] != b"{"]
-
-    def reports(self, kind: EventKind) -> list[Event]:
-        """The outbox's own events that were sent."""
-        events = [codec.decode(payload, Event) for _, payload in self.sent if payload.startswith(b"{")]
-        return [event for event in events if event.kind == kind]
+from tests.unit.device_agent.runtime.telemetry.outbox_fixture import LATE, OutboxFixture, fail
 
 
 @pytest.fixture
@@ -233,42 +162,6 @@ def test_a_dropped_message_is_not_repeated(fixture: OutboxFixture) -> None:
     assert fixture.outbox._in_flight == {}
 
 
-def test_an_event_from_memory_is_repeated_from_the_disk_once_it_is_stored(
-    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fixture.connect()
-    fixture.acknowledges = False
-    with monkeypatch.context() as patch:
-        patch.setattr(fixture.store, "put", fail)
-        fixture.event("held")
-        fixture.iterate()
-    fixture.iterate_for(module._SAVE_RETRY_S + 1)
-    assert "held" in fixture.stored()
-    assert all(number > 0 for number in fixture.outbox._in_flight)
-    fixture.acknowledge()
-    fixture.iterate()
-    assert fixture.stored() == []
-
-
-def test_events_in_memory_and_on_disk_are_delivered_independently(
-    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fixture.connect()
-    fixture.acknowledges = False
-    fixture.event("stored")
-    fixture.iterate()
-    with monkeypatch.context() as patch:
-        patch.setattr(fixture.store, "put", fail)
-        fixture.event("first", "second")
-        fixture.iterate()
-        assert fixture.events() == ["stored", "first", "second"]
-        for acknowledge in fixture.open[1:]:
-            acknowledge()
-        fixture.iterate()
-    assert fixture.outbox._unsaved == {}
-    assert fixture.stored() == ["stored"]
-
-
 def test_dropped_messages_are_reported_after_reconnection(
     fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -295,82 +188,6 @@ def test_a_stuck_thread_uses_bounded_memory_and_counts_drops(
     fixture.iterate(4)
     (report,) = fixture.reports(EventKind.BUFFER_DROPPED)
     assert report.data["events"] == 4
-
-
-# ---------------------------------------------------------------- errors of the disk
-
-
-def fail(*_: Any, **__: Any) -> Any:
-    raise OutboxStoreError("outbox.db cannot be written: is the disk full?")
-
-
-def test_with_a_full_disk_events_are_sent_from_memory_and_one_event_reports_it(
-    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fixture.store, "put", fail)
-    monkeypatch.setattr(module, "wall_ms", lambda: 7_000)
-    fixture.connect()
-    fixture.event("held")
-    fixture.iterate(2)
-    assert fixture.events() == ["held"]
-    fixture.event("next")
-    fixture.iterate(40)
-    assert fixture.events() == ["held", "next"]
-    (report,) = fixture.reports(EventKind.BUFFER_FAILED)
-    assert (report.severity, report.data, report.at_ms) == ("error", {"code": "disk"}, 7_000)
-    assert "disk full" in report.message
-
-
-def test_with_a_full_disk_events_wait_in_bounded_memory_and_measurements_are_counted(
-    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(fixture.store, "put", fail)
-        fixture.event("first")
-        fixture.measure(0, 5)
-        fixture.iterate()
-    fixture.event("second")
-    fixture.iterate()
-    assert fixture.stored() == []
-    fixture.iterate_for(module._SAVE_RETRY_S)
-    assert fixture.stored()[::2] == ["first", "second"], "with the report between them"
-    fixture.connect()
-    fixture.iterate(2)
-    (report,) = fixture.reports(EventKind.BUFFER_DROPPED)
-    assert report.data == {"measurements": 5, "events": 0}
-    monkeypatch.setattr(fixture.store, "put", fail)
-    fixture.event(*map(str, range(module._MAX_UNSAVED + 20)))
-    fixture.iterate()
-    assert len(fixture.outbox._unsaved) == module._MAX_UNSAVED
-
-
-def test_an_unusable_folder_does_not_stop_the_outbox(fixture: OutboxFixture, tmp_path: Path) -> None:
-    fixture.path = tmp_path / "missing" / "outbox.db"
-    fixture.restart()
-    fixture.connect()
-    fixture.event("held")
-    fixture.iterate(2)
-    assert fixture.events() == ["held"]
-    fixture.path.parent.mkdir()
-    fixture.iterate_for(module._SAVE_RETRY_S + 1)
-    fixture.event("again")
-    fixture.accepts = False
-    fixture.iterate()
-    assert fixture.stored() == ["again"]
-
-
-def test_read_errors_are_reported_and_unexpected_errors_do_not_stop_the_thread(
-    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    fixture.connect()
-    fixture.event("one")
-    for error in (OutboxStoreError("outbox.db cannot be read"), RuntimeError("a mistake")):
-        with monkeypatch.context() as patch:
-            patch.setattr(fixture.store, "after", mock.Mock(side_effect=error))
-            fixture.iterate()
-        assert str(error) in caplog.text
-    fixture.iterate_for(module._SAVE_RETRY_S + 1)
-    assert fixture.events() == ["one"]
 
 
 def test_the_thread_sends_at_once_and_drains_before_it_stops(fixture: OutboxFixture) -> None:

@@ -17,6 +17,7 @@ from function_app.services.messaging.mailbox import Mailbox
 from function_app.services.storage import records
 from function_app.services.storage.retention import Retention
 from tests.fakes.blobs import MemoryBlobs
+from tests.fakes.broker_ports import QueuedAcks
 from tests.fakes.tables import MemoryTables
 from tests.unit.function_app.services.messaging.conftest import ARM, PolledMailbox
 
@@ -67,12 +68,10 @@ class AckBus:
     @contextlib.asynccontextmanager
     async def acks(self, topic: str, command: str) -> AsyncIterator[AsyncIterator[Ack] | None]:
         assert (topic, command) == (ARM.topic, SIGNED.command)
-        yield None if self.statuses is None else self._received()
-
-    async def _received(self) -> AsyncIterator[Ack]:
+        received: asyncio.Queue[Ack] = asyncio.Queue()
         for status in self.statuses or ():
-            yield ack(status)
-        await asyncio.Event().wait()
+            received.put_nowait(ack(status))
+        yield None if self.statuses is None else QueuedAcks(received)
 
 
 def ack(status: AckStatus) -> Ack:
@@ -82,7 +81,6 @@ def ack(status: AckStatus) -> Ack:
 
 SIGNED = SignedCommand("aaaaaaaaaa-arm-00000000000000000000", b"{}", 2**45)
 RECEIVED, STARTED, FAILED, EXPIRED = AckStatus.RECEIVED, AckStatus.STARTED, AckStatus.FAILED, AckStatus.EXPIRED
-LATE = 1.0
 
 
 @pytest.mark.parametrize(
@@ -91,12 +89,12 @@ LATE = 1.0
         ("mqtt", [RECEIVED, STARTED], None, Confirmation(confirmed=True), 0.0),
         ("mqtt", [RECEIVED, FAILED], None, Confirmation(confirmed=False, device_epoch=7), 0.0),
         ("mqtt", [EXPIRED, STARTED], None, Confirmation(confirmed=False), 0.0),
-        ("mqtt", [RECEIVED], STARTED, Confirmation(confirmed=False), LATE),
+        ("mqtt", [RECEIVED], STARTED, Confirmation(confirmed=False), 1.0),
         ("mqtt", None, STARTED, Confirmation(confirmed=True), 0.5),
         ("xmpp", [STARTED], None, Confirmation(confirmed=True), 0.0),
         ("xmpp", [RECEIVED], FAILED, Confirmation(confirmed=False, device_epoch=7), 0.5),
-        ("xmpp", [], None, Confirmation(confirmed=False), LATE),
-        ("http", [STARTED], None, Confirmation(confirmed=False), LATE),
+        ("xmpp", [], None, Confirmation(confirmed=False), 1.0),
+        ("http", [STARTED], None, Confirmation(confirmed=False), 1.0),
         ("http", [], STARTED, Confirmation(confirmed=True), 0.5),
     ],
 )
@@ -117,22 +115,38 @@ def test_the_first_decisive_ack_of_bus_and_tables_is_the_answer(  # noqa: PLR091
         if in_tables is not None:
             await polled_mailbox.store_ack(ARM.agent, ack(in_tables))
 
-    task = loop.create_task(store())
-    device = replace(ARM, transport=transport)
-    assert loop.complete(delivery.send_confirmed(device, SIGNED, wait_ms=round(LATE * 1000))) == answer
-    assert loop.time() == pytest.approx(ends_s, abs=0.001)
-    loop.complete(asyncio.wait_for(task, 1))
-    assert asyncio.all_tasks(loop) == set()
+    async def send() -> Confirmation:
+        storing = loop.create_task(store())
+        confirmation = await delivery.send_confirmed(replace(ARM, transport=transport), SIGNED, wait_ms=1000)
+        assert polled_mailbox._waiting == {}, "no task waits any longer"
+        assert loop.time() == pytest.approx(ends_s, abs=0.0001)
+        await storing
+        return confirmation
+
+    assert loop.complete(send()) == answer
+    if transport == "mqtt" and on_bus is not None:
+        assert polled_mailbox.tables.rows(records.MAILBOX) == []
 
 
 def test_without_a_wait_no_ack_is_expected(polled_mailbox: PolledMailbox) -> None:
-    delivery = Delivery(bus=cast("Any", None), mailbox=polled_mailbox, relay=cast("Any", None), tracing=NoTracing())
-    for wait_ms, rows in ((0, 1), (10, 2)):
+    tracing, unused = SpanNames(), cast("Any", None)
+    delivery = Delivery(bus=unused, mailbox=polled_mailbox, relay=unused, tracing=tracing)
+    for wait_ms, count in ((0, 1), (10, 2)):
         polled_mailbox.loop.complete(delivery.send_confirmed(ARM, SIGNED, wait_ms=wait_ms))
-        assert len(polled_mailbox.tables.rows(records.MAILBOX)) == rows
-        assert all(
-            row.data["expires_ms"] == SIGNED.expires_ms for _, row in polled_mailbox.tables.rows(records.MAILBOX)
-        )
+        rows = [row for _, row in polled_mailbox.tables.rows(records.MAILBOX)]
+        assert [row.data["expires_ms"] for row in rows] == [SIGNED.expires_ms] * count
+    assert tracing.names == ["publish command", "await acks"] * 2
+
+
+class SpanNames(NoTracing):
+    """Records the names of spans."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def span(self, name: str, /) -> contextlib.AbstractContextManager[None]:  # type: ignore[override]
+        self.names.append(name)
+        return contextlib.nullcontext()
 
 
 class Relay:
