@@ -178,9 +178,9 @@ def _command(
     *,
     caller: str,
     ttl_ms: int,
+    traceparent: str,
     epoch: int = 0,
     issued_ms: int = 0,
-    traceparent: str = "",
 ) -> Command:
     return Command(
         id=id_,

@@ -50,7 +50,7 @@ class PresenceIngest:
         self._key_announcer = key_announcer
         self._clock = clock
 
-    async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
+    async def ingest(self, topic: Topic, payload: bytes, *, by: Transport) -> None:
         """Store one message.
 
         Messages from other transports are republished on the broker and return from there later; they are stored only

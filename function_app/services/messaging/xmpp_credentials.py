@@ -170,12 +170,10 @@ class XmppCredentials:
 
     async def _claims(self, token: str) -> dict[str, object]:
         try:
-            kid = str(jwt.get_unverified_header(token).get("kid", ""))
-            key = (await self._keys.public(kid)).get(kid)
-            if key is None:
-                raise _refused()
+            kid = str(jwt.get_unverified_header(token)["kid"])
+            key = (await self._keys.public(kid))[kid]
             return decode(token, key, XMPP, now_s=self._clock.now_ms() / 1000, leeway_s=0)
-        except (jwt.PyJWTError, ValueError) as error:
+        except (jwt.PyJWTError, KeyError, ValueError) as error:
             raise _refused() from error
 
     def _left_s(self, claims: dict[str, object]) -> int:

@@ -3,6 +3,7 @@
 import errno
 import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import msgspec
@@ -10,6 +11,7 @@ import pytest
 
 from device_agent.protocol import Ack, AckStatus, Reason, StopLatch
 from device_agent.runtime.storage.journal import Journal, JournalError
+from tests.fakes.tracing import TRACEPARENT
 
 
 def ack(command: str, status: AckStatus = AckStatus.RECEIVED, sequence: int = 1, at_ms: int = 1000) -> Ack:
@@ -64,6 +66,13 @@ def test_a_command_rejected_because_of_its_epoch_is_new_again_with_a_higher_epoc
         journal.record(ack("c1", status, 2))
         for epoch in (1, 7, 8, 9):
             assert journal.begin("arm", ack("c1"), issued_ms=1, epoch=epoch) == ack("c1", status, 2)
+
+
+def test_a_command_rejected_for_another_reason_is_not_processed_again(journal: Journal) -> None:
+    journal.begin("arm", ack("c1"), issued_ms=1)
+    rejected = msgspec.structs.replace(ack("c1", AckStatus.FAILED, 2), reason=Reason(code="stopped", message=""))
+    journal.record(rejected)
+    assert journal.begin("arm", ack("c1"), issued_ms=1, epoch=8) == rejected
 
 
 def test_open_commands_of_a_previous_run_are_failed(open_journal: OpenJournal) -> None:
@@ -152,8 +161,20 @@ def test_an_invalid_journal_file_is_named_and_not_deleted(tmp_path: Path) -> Non
     assert path.read_bytes().startswith(b"this is not")
 
 
-def test_a_closed_journal_raises_but_ignores_deliveries(journal: Journal) -> None:
+def test_any_thread_may_write(journal: Journal) -> None:
+    with ThreadPoolExecutor() as other:
+        assert other.submit(journal.next_session).result() == 1
+
+
+def test_writes_are_fast_and_use_little_memory(journal: Journal) -> None:
+    settings = [journal._execute(f"PRAGMA {name}")[0][0] for name in ("journal_mode", "synchronous", "cache_size")]
+    assert settings == ["wal", 1, -256]
+
+
+def test_a_closed_journal_raises_but_ignores_deliveries(journal: Journal, tmp_path: Path) -> None:
+    journal.begin("arm", ack("c1"), issued_ms=1)
     journal.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["journal.db"], "the log is in the file"
     with pytest.raises(JournalError):
         journal.next_session()
     journal.delivered(ack("c1"))
@@ -163,12 +184,15 @@ def test_a_closed_journal_raises_but_ignores_deliveries(journal: Journal) -> Non
 def test_sync_writes_to_disk_without_blocking_writers(
     journal: Journal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    synced: list[int] = []
-    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_ino))
+    synced: list[tuple[int, int]] = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append((descriptor, os.fstat(descriptor).st_ino)))
     journal.begin("arm", ack("1", AckStatus.RECEIVED), issued_ms=1)
     with journal._lock:
         journal.sync()
-    assert synced == [next(tmp_path.glob("*-wal")).stat().st_ino]
+    ((descriptor, file),) = synced
+    assert file == next(tmp_path.glob("*-wal")).stat().st_ino
+    with pytest.raises(OSError, match="descriptor"):
+        os.fstat(descriptor)
 
 
 def test_a_failed_sync_raises(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,9 +251,11 @@ def test_movement_versions_never_decrease_and_belong_to_device_author_type_and_n
 
 
 def test_an_ended_command_of_a_previous_run_has_its_time_and_is_undelivered(open_journal: OpenJournal) -> None:
-    open_journal().begin("arm", ack("c1"), issued_ms=1)
+    traced = msgspec.structs.replace(ack("c1"), traceparent=TRACEPARENT)
+    open_journal().begin("arm", traced, issued_ms=1)
     after = open_journal()
     assert after.end_open(now_ms=7, tick_ms=8) == 1
     (ended,) = after.undelivered("arm").values()
+    assert ended.traceparent == TRACEPARENT
     assert (ended.id, ended.status, ended.sequence, ended.at_ms, ended.tick_ms) == ("c1", AckStatus.FAILED, 2, 7, 8)
     assert after.end_open(now_ms=9, tick_ms=9) == 0

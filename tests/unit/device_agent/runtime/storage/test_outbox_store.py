@@ -2,6 +2,7 @@
 
 import sqlite3
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -130,6 +131,15 @@ def test_as_few_messages_as_needed_are_dropped(  # noqa: PLR0917 (fixtures and p
         assert dropped(store) == [DroppedCount(OWN + "arm", measurements=2 - len(late), events=3 - len(events))]
 
 
+def test_messages_of_one_kind_are_dropped_in_one_transaction(open_store: OpenStore) -> None:
+    store = open_store(max_bytes=3 * SIZE - 1)
+    deletions: list[str] = []
+    store._connection().set_trace_callback(lambda sql: deletions.append(sql) if sql.startswith("DELETE") else None)
+    store.put([item(number) for number in range(4)], now_ms=NOW_MS)
+    assert numbers(store) == [2, 3]
+    assert len([each for each in deletions if "id <=" in each]) == 1
+
+
 def test_the_last_message_is_dropped_if_it_is_too_long(open_store: OpenStore) -> None:
     store = open_store(max_bytes=SIZE - 1)
     store.put([item(1)], now_ms=NOW_MS)
@@ -155,6 +165,30 @@ def test_old_measurements_are_dropped_and_counted(store: OutboxStore) -> None:
     assert numbers(store, late=False) == [3], "events do not expire"
     assert dropped(store) == [DroppedCount(OWN + "arm", measurements=2, events=0)]
     assert dropped(store) == [], "reported once"
+
+
+def test_ages_are_checked_once_a_minute_and_after_the_clock_was_set_back(store: OutboxStore) -> None:
+    store.put([], now_ms=NOW_MS)
+    store.put([item(1, at_ms=NOW_MS - 3_600_000), item(2, at_ms=NOW_MS - 3_600_000 - 1)], now_ms=NOW_MS + 59_999)
+    assert numbers(store) == [1, 2]
+    store.enforce_bounds(now_ms=NOW_MS + 60_000)
+    assert numbers(store) == []
+    store.put([item(3), item(4, at_ms=NOW_MS - 3_600_001)], now_ms=NOW_MS)
+    assert numbers(store) == [3]
+
+
+def test_any_thread_may_use_the_store_that_was_opened(store: OutboxStore) -> None:
+    with ThreadPoolExecutor() as other:
+        other.submit(store.put, [item(1)], now_ms=NOW_MS).result()
+    assert numbers(store) == [1]
+    settings = [store._connection().execute(f"PRAGMA {name}").fetchone()[0] for name in ("journal_mode", "synchronous")]
+    assert settings == ["wal", 1]
+
+
+def test_a_closed_store_has_its_log_in_the_file(store: OutboxStore, tmp_path: Path) -> None:
+    store.put([item(1)], now_ms=NOW_MS)
+    store.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["outbox.db"]
 
 
 def test_stored_items_are_read_by_id(store: OutboxStore) -> None:

@@ -9,11 +9,12 @@ from unittest.mock import Mock
 
 import pytest
 
-from device_agent.protocol import Ack, AckStatus, codec
+from device_agent.protocol import Ack, AckStatus, Reason, codec
 from device_agent.runtime.storage.journal import Journal, JournalError
 from device_agent.runtime.telemetry import device_publisher as module
 from device_agent.runtime.telemetry.device_publisher import DevicePublisher
 from tests.fakes.drivers import robot_type
+from tests.fakes.tracing import TRACEPARENT
 
 
 class PublisherFixture:
@@ -25,7 +26,10 @@ class PublisherFixture:
         self.journal = Journal(folder / "journal.db")
         self.journal.open(now_ms=0)
         self.sent: list[tuple[float, str]] = []
+        self.acks: list[Ack] = []
         self.delivered: dict[str, Callable[[], None]] = {}
+        self.steps: list[tuple[str, AckStatus, Reason | None]] = []
+        self.ended: list[str] = []
         self.publisher = DevicePublisher(
             address=("s", "a", "arm"),
             label="Arm",
@@ -38,13 +42,23 @@ class PublisherFixture:
             journal=self.journal,
             publish=self.publish,
             outbox=cast("Any", None),
+            traces=cast("Any", self),
         )
 
-    def publish(self, topic: str, payload: bytes, *, delivered: Callable[[], None] | None = None, **_: Any) -> bool:
+    def step(self, command: str, status: AckStatus, reason: Reason | None) -> str:
+        self.steps.append((command, status, reason))
+        return TRACEPARENT
+
+    def end(self, command: str) -> None:
+        self.ended.append(command)
+
+    def publish(self, topic: str, payload: bytes, *, delivered: Callable[[], None] | None = None, **more: Any) -> bool:
         if topic.endswith("/ack"):
+            assert (topic, more) == ("ts/v1/s/a/arm/ack", {"qos": 1})
             assert delivered is not None
             ack = codec.decode(payload, Ack)
             self.sent.append((self.now_s, ack.id))
+            self.acks.append(ack)
             self.delivered[ack.id] = delivered
         return True
 
@@ -71,6 +85,28 @@ def fixture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Publish
 
 def pauses(times: list[float]) -> list[float]:
     return [later - sooner for sooner, later in pairwise(times)]
+
+
+def test_acks_have_their_sequence_reason_and_trace(fixture: PublisherFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "wall_ms", lambda: 2000)
+    monkeypatch.setattr(module, "tick_ms", lambda: 30)
+    reason = Reason(code="stopped", message="stop")
+    common: dict[str, Any] = {"id": "c1", "at_ms": 2000, "tick_ms": 30, "traceparent": TRACEPARENT}
+    received = fixture.publisher.create_ack("c1", AckStatus.RECEIVED)
+    assert received == Ack(status=AckStatus.RECEIVED, sequence=1, **common)
+    fixture.journal.begin("arm", received, issued_ms=1)
+    for status, sequence, fields in (
+        (AckStatus.STARTED, 2, {"progress": 0.5}),
+        (AckStatus.FAILED, 3, {"reason": reason}),
+    ):
+        fixture.publisher.report("c1", status, **fields)
+        expected = Ack(status=status, sequence=sequence, **fields, **common)
+        assert fixture.acks[-1] == expected
+        assert list(fixture.journal.undelivered("arm").values()) == [expected]
+        assert fixture.ended == (["c1"] if status.terminal else [])
+    assert fixture.steps[-1] == ("c1", AckStatus.FAILED, reason)
+    for command in ("c1", "c2"):
+        assert fixture.publisher.create_ack(command, AckStatus.FAILED).sequence == 1, "none before, or ended"
 
 
 def test_the_pauses_grow_to_eight_seconds_and_the_repetition_ends_with_the_delivery(fixture: PublisherFixture) -> None:

@@ -11,7 +11,7 @@ from device_agent.protocol.events import EventKind
 from device_agent.runtime.telemetry import outbox as module
 from device_agent.runtime.telemetry.outbox import BUSY_RATE_HZ, RATE_HZ
 from tests.harness.agent.device_harness import WITHIN_S, eventually
-from tests.unit.device_agent.runtime.telemetry.outbox_fixture import LATE, OutboxFixture, fail
+from tests.unit.device_agent.runtime.telemetry.outbox_fixture import ARM, LATE, OutboxFixture, fail
 
 
 @pytest.fixture
@@ -75,6 +75,16 @@ def test_measurements_are_stored_at_a_reduced_rate_from_shortly_before_the_link_
     fixture.measure(1000, 2000, each_s=0.02)
     fixture.iterate()
     assert 13 + 19 <= len(fixture.stored(late=True)) <= 13 + 21, "one a second of twenty seconds"
+
+
+def test_each_stream_has_its_own_rate_and_is_stored_once_per_lost_link(fixture: OutboxFixture) -> None:
+    fixture.connect()
+    for topic, payload in ((LATE, b"first"), (ARM + "/late/heat", b"second"), (LATE, b"too early")):
+        fixture.outbox.add_measurement(topic, payload, at_ms=1, sent=True, now_s=fixture.now_s)
+    for _ in range(2):
+        fixture.outbox.link_changed(False)
+        fixture.iterate()
+        assert fixture.stored(late=True) == ["first", "second"]
 
 
 def test_the_send_rate_is_low_and_lower_during_motion(fixture: OutboxFixture) -> None:

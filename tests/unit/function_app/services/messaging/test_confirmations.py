@@ -61,9 +61,10 @@ def test_a_message_that_will_never_be_accepted_is_confirmed(
 
 
 def test_states_and_invalid_topics_are_not_confirmed(cloud: Cloud, robot: Robot, confirmed: Client) -> None:
+    ack = (robot.topic(topics.ACK), b"{}")
     others = [("no/topic", b"{}"), (robot.topic(topics.STATE), b"{}"), (robot.topic(topics.STORED), b"{}")]
-    cloud.run(cloud.functions.confirmations.publish(others))
-    assert stored_ids(confirmed) == {}
+    cloud.run(cloud.functions.confirmations.publish([*others, ack]))
+    assert stored_ids(confirmed) == {robot.topic(topics.STORED): [message_id(*ack)]}
 
 
 def test_a_batch_is_confirmed_in_few_messages_of_bounded_size(cloud: Cloud, robot: Robot, confirmed: Client) -> None:

@@ -125,7 +125,7 @@ def test_the_first_decisive_ack_of_bus_and_tables_is_the_answer(  # noqa: PLR091
 
     assert loop.complete(send()) == answer
     if transport == "mqtt" and on_bus is not None:
-        assert polled_mailbox.tables.rows(records.MAILBOX) == []
+        assert (polled_mailbox.tables.rows(records.MAILBOX), polled_mailbox.read_s) == ([], [])
 
 
 def test_without_a_wait_no_ack_is_expected(polled_mailbox: PolledMailbox) -> None:
@@ -179,12 +179,14 @@ def test_each_transport_gets_commands_and_stops_in_its_own_way(
     used: Any = None if transport == "mqtt" else mailbox
     delivery = Delivery(bus=cast("Any", bus), mailbox=used, relay=cast("Any", relay), tracing=NoTracing())
     device = replace(ARM, transport=transport)
-    signed = SignedCommand("aaaaaaaaaa-arm-00000000000000000000", b"{}", clock.now_ms() + 5_000)
+    signed = SIGNED._replace(first=True)
 
     async def send() -> int:
         await delivery.send(device, signed)
         await delivery.stop(device, "author", b"stop")
-        stored = len((await tables.query(records.MAILBOX, ARM.agent, limit=9)).rows)
+        rows = (await tables.query(records.MAILBOX, ARM.agent, limit=9)).rows
+        assert [row.key[0] for row in rows] == ["0"] * len(rows), "a Stop comes first"
+        stored = len(rows)
         await delivery.withdraw(device, signed.command)
         assert not (await tables.query(records.MAILBOX, ARM.agent, limit=9)).rows
         return stored

@@ -163,17 +163,22 @@ def test_rows_are_deleted_in_the_hour_after_their_end(
     assert keys(polled_mailbox) == []
 
 
-def test_one_deletion_is_scheduled_per_agent_and_hour(
-    polled_mailbox: PolledMailbox, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_deletion_is_scheduled_per_agent_and_hour(polled_mailbox: PolledMailbox) -> None:
     for command, expires_ms, scheduled in (("c1", HOUR_MS, 1), ("c2", HOUR_MS - 1, 1), ("c3", HOUR_MS + 1, 2)):
         polled_mailbox.loop.complete(polled_mailbox.expect_ack(ARM, command, expires_ms=expires_ms))
         assert len(keys(polled_mailbox, records.FORGET)) == scheduled
     polled_mailbox.tables.drop(records.FORGET)
     polled_mailbox.loop.complete(polled_mailbox.expect_ack(ARM, "c4", expires_ms=HOUR_MS + 1))
     assert keys(polled_mailbox, records.FORGET) == [], "it is scheduled already"
-    monkeypatch.setattr(module, "PAGE", 1)
-    for number in range(5):
+
+
+def test_the_memory_of_scheduled_deletions_is_bounded(
+    polled_mailbox: PolledMailbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "PAGE", 2)
+    sizes = []
+    for number in range(6):
         device = replace(ARM, agent=f"agent{number}")
         polled_mailbox.loop.complete(polled_mailbox.expect_ack(device, "c1", expires_ms=1))
-    assert len(polled_mailbox._scheduled) <= 2, "memory is bounded"
+        sizes.append(len(polled_mailbox._scheduled))
+    assert sizes == [1, 2, 3, 4, 5, 1]

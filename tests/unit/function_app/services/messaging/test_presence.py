@@ -58,8 +58,8 @@ class PresenceFixture:
         topic = topics.conn(*place) if kind == topics.CONN else topics.device(*place, "arm", kind, name)
         self.ingest_at(topic, message, **options)
 
-    def ingest_at(self, topic: str, message: Any, **options: Any) -> None:
-        self.cloud.run(self.cloud.functions.presence.ingest(topics.parse(topic), codec.encode(message), **options))
+    def ingest_at(self, topic: str, message: Any, *, by: Any = "mqtt") -> None:
+        self.cloud.run(self.cloud.functions.presence.ingest(topics.parse(topic), codec.encode(message), by=by))
 
     def stored(self, table: str, partition: str, key: str, kind: type[Any]) -> Any:
         return self.cloud.run(records.find(self.cloud.functions.tables, table, partition, key, kind))[1]
@@ -109,6 +109,13 @@ def test_presence_is_stored_as_the_link_of_the_agent(fixture: PresenceFixture) -
     )
 
 
+def test_the_will_of_an_earlier_connection_is_ignored(fixture: PresenceFixture) -> None:
+    fixture.ingest(topics.CONN, PRESENCE)
+    for session, online in ((6, True), (7, False)):
+        fixture.ingest(topics.CONN, Presence(online=False, session=session, at_ms=6))
+        assert (fixture.link.session, fixture.link.online) == (7, online)
+
+
 @pytest.mark.parametrize(("transport", "polled"), [("http", True), ("xmpp", False)])
 def test_only_an_agent_over_http_counts_as_polling(fixture: PresenceFixture, transport: Any, polled: bool) -> None:
     fixture.change_agent(lambda agent: replace(agent, transport=transport))
@@ -125,6 +132,7 @@ def test_only_an_agent_that_connects_is_watched_for_silence(fixture: PresenceFix
 
 
 def test_a_state_is_stored_with_its_epochs_and_faults(fixture: PresenceFixture, memory: Memory) -> None:
+    fixture.ingest(topics.STATE, State(device="arm", at_ms=4, tick_ms=5, mode=Mode.ACTION, epoch=8))
     fixture.ingest(topics.STATE, STATE)
     now_ms = fixture.cloud.clock.now_ms()
     pairing = fixture.agent.pairing
@@ -195,6 +203,12 @@ class TestEvents:
         assert (record["event"], record["target"], record["at"]) == ("stop-latched", fixture.robot.device, rfc3339(5))
         assert (record["outcome"], record["actor"]) == ("done", unknown)
         assert record["data"] == {"message": "st\ufffdop", "caller": unknown, "reason": "", "verified": False}
+
+    def test_each_reported_stop_is_recorded_once(self, fixture: PresenceFixture, anna: Person) -> None:
+        for id_ in ("e1", "e1", "e2"):
+            fixture.ingest(topics.EVENT, event(id=id_, kind="stop-latched", message=id_))
+        items = anna.get("/accounts/me/audit").json()["items"]
+        assert [item["data"]["message"] for item in items if item["event"] == "stop-latched"] == ["e2", "e1"]
 
     @pytest.mark.parametrize(("age_ms", "records_"), [(SAME_STOP_MS, 0), (SAME_STOP_MS + 1, 1)])
     def test_a_report_of_a_stop_within_a_minute_of_its_record_is_not_recorded(
