@@ -182,20 +182,18 @@ class StopDevices:
         now_ms = self._clock.now_ms()
         stop = command_id(device.id, now_ms)
         plain = asyncio.create_task(self._repeat(device, caller.account, Stop(id=stop, reason=reason)))
-        writing: asyncio.Task[None] | None = None
+        writing = asyncio.create_task(self._write(caller, device, reason, gate, (stop, now_ms)))
         try:
             await asyncio.sleep(0)  # publish first, before signing and writing
-            writing = asyncio.create_task(self._write(caller, device, reason, gate, (stop, now_ms)))
             order = StopDevice(reason=reason)
             result = await self._command_sender.send_confirmed(
                 device, order, caller=caller.name, epoch=0, wait_ms=CONFIRM_MS, command=stop
             )
         finally:
             plain.cancel()
-            with contextlib.suppress(asyncio.CancelledError, BusUnavailable):
+            with contextlib.suppress(asyncio.CancelledError):
                 await plain
-            if writing is not None:
-                await writing
+            await writing
         return result.confirmed
 
     async def _repeat(self, device: Device, author: str, stop: Stop) -> None:
@@ -205,7 +203,6 @@ class StopDevices:
                 await self._delivery.stop(device, author, payload)
             except BusUnavailable as error:
                 _log.warning("stop of %s: %s", device.id, error)
-                raise
             await asyncio.sleep(REPEAT_S)
 
     async def _write(

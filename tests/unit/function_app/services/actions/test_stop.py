@@ -1,15 +1,25 @@
 """Stop and its reset need no lease; Stop is published twice: unsigned to the control loop, and as a command."""
 
+import asyncio
 from collections.abc import Iterator
 from typing import Any
+from unittest import mock
 
 import pytest
 
 from device_agent.protocol import AckStatus, ResetStop, StopDevice, codec, topics
+from function_app.domain.devices.devices import Device
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.monitoring import Counter
+from function_app.services.actions.stop import StopOutcome, StopResult
+from function_app.services.control.lease_store import LeaseStore
+from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.fakes.broker import MemoryBroker
 from tests.harness.cloud.cloud import Cloud, Person, paired, problem
 from tests.harness.network.brokers import Message
+from tests.unit.function_app.services.sharing.shares import share
 
 TwoRooms = tuple[Person, Robot, Robot, str]
 
@@ -29,14 +39,20 @@ def test_stop_and_reset_are_sent_and_recorded(anna: Person, robot: Robot) -> Non
     answer = elsewhere.post(f"/devices/{robot.device}/stop", {"reason": "smoke"})
     assert outcome(answer) == (200, "confirmed")
     assert robot.stops[0].reason == "smoke"
-    assert [command.request for command in robot.received(StopDevice)] == [StopDevice(reason="smoke")]
+    (command,) = robot.received(StopDevice)
+    assert (command.request, command.epoch, command.caller) == (StopDevice(reason="smoke"), 0, "anna")
+    assert command.id == robot.stops[0].id, "the device applies it once"
     assert robot.received(ResetStop) == []
     assert elsewhere.post(f"/devices/{robot.device}/stop/reset").json() == {"confirmed": True}
     assert len(robot.received(ResetStop)) == 1
     reset, stop, _ = anna.get(f"/devices/{robot.device}/events").json()["items"]
     assert (reset["kind"], reset["data"]["caller"], reset["data"]["from"]) == ("stop-reset-ordered", "anna", "anna")
     assert (stop["kind"], stop["data"]) == ("stop-ordered", {"caller": "anna", "reason": "smoke"})
-    assert stop["severity"] == "warning"
+    assert (stop["severity"], stop["id"]) == ("warning", command.id)
+    assert all(text in stop["message"] for text in ("anna", "smoke"))
+    elsewhere.post(f"/devices/{robot.device}/stop")
+    without, *_ = anna.get(f"/devices/{robot.device}/events").json()["items"]
+    assert (without["data"]["reason"], without["message"].count(":")) == ("", 0)
 
 
 def test_each_reset_begins_a_new_epoch(anna: Person, robot: Robot) -> None:
@@ -143,3 +159,111 @@ def test_without_a_broker_each_device_is_reported(anna: Person, robot: Robot, br
     assert item["problem"]["type"] == "/problems/broker-unavailable"
     answer = anna.post(f"/devices/{robot.device}/stop")
     assert problem(answer, 503, "broker-unavailable")["outcome"] == "unreachable"
+
+
+def test_a_viewer_may_stop_a_space_only_where_it_operates(two_rooms: TwoRooms, bert: Person) -> None:
+    anna, first, second, lab = two_rooms
+    problem(bert.post(f"/spaces/{lab}/stop"), 404, "space-unknown")
+    share(anna, f"spaces/{lab}", bert, "viewer")
+    problem(bert.post(f"/spaces/{lab}/stop"), 403, "forbidden")
+    assert (second.stops, second.commands) == ([], [])
+    share(anna, f"devices/{second.device}", bert, "operator")
+    assert outcomes(bert.post(f"/spaces/{lab}/stop")) == {second.device: "confirmed"}
+    assert (first.stops, first.commands) == ([], [])
+
+
+def test_stop_of_an_own_empty_space_stops_nothing(anna: Person, robot: Robot) -> None:
+    attic = anna.post("/spaces", {"name": "Attic"}).json()["id"]
+    answer = anna.post(f"/spaces/{attic}/stop")
+    assert (answer.status_code, answer.json()) == (200, {"items": []})
+    assert robot.stops == []
+
+
+@pytest.mark.parametrize(("path", "wanted"), [("stop", "stop"), ("stop/reset", "reset Stop")])
+def test_a_refused_stop_or_reset_is_recorded(anna: Person, bert: Person, robot: Robot, path: str, wanted: str) -> None:
+    share(anna, f"devices/{robot.device}", bert, "viewer")
+    problem(bert.post(f"/devices/{robot.device}/{path}"), 403, "forbidden")
+    assert (robot.stops, robot.commands) == ([], [])
+    event, *_ = anna.get(f"/devices/{robot.device}/events").json()["items"]
+    assert event["kind"] == "command-rejected"
+    assert event["data"] == {"caller": "bert", "wanted": wanted, "code": "forbidden"}
+
+
+def test_the_first_reset_has_the_first_epoch(anna: Person, robot: Robot) -> None:
+    anna.post(f"/devices/{robot.device}/stop/reset")
+    assert [command.epoch for command in robot.received(ResetStop)] == [1]
+
+
+def test_no_reset_is_sent_for_a_share_that_ended_meanwhile(
+    cloud: Cloud, anna: Person, bert: Person, robot: Robot
+) -> None:
+    share(anna, f"devices/{robot.device}", bert, "operator")
+    store = cloud.functions.lease_store
+
+    async def change(*arguments: Any, **options: Any) -> Any:
+        changed = await LeaseStore.change(store, *arguments, **options)
+        tables = cloud.functions.tables
+        await records.remove(tables, records.SHARES, f"device:{robot.device}", f"account:{bert.account}")
+        return changed
+
+    with mock.patch.object(store, "change", change):
+        problem(bert.post(f"/devices/{robot.device}/stop/reset"), 404, "device-unknown")
+    assert robot.received(ResetStop) == []
+
+
+def test_the_unsigned_message_names_the_account_and_is_repeated_after_a_failure(
+    anna: Person, robot: Robot, broker: MemoryBroker
+) -> None:
+    robot.silent = True
+    publish = broker.publish
+    published: list[str] = []
+
+    def failing(topic: str, payload: bytes, **options: Any) -> None:
+        published.append(topic)
+        if len(published) == 1:
+            raise BusUnavailable("the broker did not confirm the message")
+        publish(topic, payload, **options)
+
+    with mock.patch.object(broker, "publish", failing):
+        assert outcome(anna.post(f"/devices/{robot.device}/stop")) == (202, "sent")
+    assert published[0] == robot.topic(f"{topics.STOP}/{anna.account}"), "before the signed command"
+    assert len(robot.stops) >= 3
+    assert len(robot.received(StopDevice)) == 1
+
+
+def test_the_result_is_returned_after_the_queue_was_cancelled_and_the_last_message_was_sent(
+    cloud: Cloud, anna: Person, robot: Robot
+) -> None:
+    """A message that is sent after a reset would latch Stop again."""
+    cancelled: list[str] = []
+    last_sent: list[str] = []
+
+    async def ending(device: Device, *_: Any) -> None:
+        try:
+            await asyncio.sleep(60)
+        finally:
+            await asyncio.sleep(0.5)
+            last_sent.append(device.id)
+
+    async def slow(device: str, why: str) -> None:
+        await asyncio.sleep(0.5)
+        cancelled.append(f"{device} {why}")
+
+    with (
+        mock.patch.object(cloud.functions.queues, "cancel_all", slow),
+        mock.patch.object(cloud.functions.delivery, "stop", ending),
+    ):
+        caller = Identity(anna.account, anna.name, anna.session)
+        result = cloud.run(cloud.functions.stop.stop(caller, robot.device, ""))
+    assert result == StopResult(robot.device, StopOutcome.CONFIRMED)
+    assert cancelled == [f"{robot.device} stopped"]
+    assert last_sent == [robot.device]
+
+
+def test_outcomes_are_counted(cloud: Cloud, anna: Person, robot: Robot) -> None:
+    counted: list[tuple[Counter, str]] = []
+    with mock.patch.object(cloud.functions.metrics, "count", lambda *measured: counted.append(measured)):
+        anna.post(f"/devices/{robot.device}/stop")
+        robot.silent = True
+        anna.post("/stop")
+    assert [outcome for counter, outcome in counted if counter is Counter.STOPS] == ["confirmed", "sent"]
