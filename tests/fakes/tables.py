@@ -65,6 +65,7 @@ class MemoryTables:
         texts = row_codec.check_batch(writes)
         partition = self.partition(table, writes[0].row.partition)
         for write in writes:
+            assert write.kind in {"create", "replace", "delete"}
             current = partition.rows.get(write.row.key)
             if write.kind == "create" and current is not None:
                 raise Conflict(f"{table}: '{write.row.key}' exists")
