@@ -87,7 +87,7 @@ class Action:
         times: Status → time [ms since 1970]; ``published`` by the cloud clock, later ones by the agent clock.
         received: Status → time of reception in the cloud, by the cloud clock [ms since 1970].
         sequence: Sequence number of the newest ack.
-        cancel_requested: Whether the device was asked to cancel it.
+        cancel_id: Id of the command that cancels it; empty: not cancelled.
         idempotency_key: Key of the row with its idempotency key, or empty.
         reissuable: Whether its command may be issued once more with a higher epoch: the request named no epoch.
         traceparent: The request's span, for its command; empty: not traced.
@@ -111,7 +111,7 @@ class Action:
     output: str = ""
     result: dict[str, Any] = field(default_factory=dict)
     sequence: int = -1
-    cancel_requested: bool = False
+    cancel_id: str = ""
     idempotency_key: str = ""
     received: dict[str, int] = field(default_factory=dict)
     session: str = ""
@@ -160,7 +160,7 @@ def apply_report(action: Action, report: AckReport) -> Action:
     """The action after an ack. Duplicate, late and reordered acks never revert a step."""
     if action.status is Status.QUEUED or (action.status.terminal and not is_lost(action)):
         return action  # a queued action was never sent, so this ack is not genuine
-    if report.status is Status.EXPIRED and action.cancel_requested:
+    if report.status is Status.EXPIRED and action.cancel_id:
         reason = {"code": "cancelled", "message": "Cancelled before the device received it."}
         report = replace(report, status=Status.CANCELLED, reason=reason)
     if report.status.terminal and report.status is not Status.DONE and is_withdrawn(action):
@@ -335,4 +335,4 @@ def _step_in_slot(action: Action, now_ms: int) -> NextStep:
         return NextStep.CANCEL if acknowledged else NextStep.ASK
     if acknowledged:
         return NextStep.WAIT
-    return NextStep.CANCEL if action.cancel_requested else NextStep.PUBLISH
+    return NextStep.CANCEL if action.cancel_id else NextStep.PUBLISH

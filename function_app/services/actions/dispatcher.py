@@ -4,7 +4,7 @@ import msgspec
 
 from device_agent.protocol import RunMovement, Task
 from function_app.domain.actions.action import ASK_MS, KEY_ENDED, SIGNED_OUT, UNSHARED, Action, mark_published
-from function_app.domain.actions.queue import UNPAIRED
+from function_app.domain.actions.queue import DROPPED, UNPAIRED
 from function_app.domain.common.ids import split_command, split_device
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent, Device, Link
@@ -27,6 +27,7 @@ class PermissionEnded(Exception):  # noqa: N818 (an outcome that callers expect)
     """The account may no longer run the action; ``why`` is a key of ``DROPPED``."""
 
     def __init__(self, why: str) -> None:
+        super().__init__(DROPPED[why][1])
         self.why = why
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from device_agent.protocol import CancelAction
 from function_app.domain.actions.action import Action, Status, end
-from function_app.domain.common.ids import split_command
+from function_app.domain.common.ids import command_id, split_command
 from function_app.domain.common.problems import broker_unavailable, not_found
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
@@ -65,18 +65,22 @@ class Actions:
         """
         device, stored = await self._find(caller, action)
         require_operator(device)
-        now_ms = self._clock.now_ms()
-        change = self._action_store.change(action, lambda existing: _cancelling(existing, now_ms), existing=stored)
-        stored = await change or stored
         if stored.action.status.terminal:
             return stored.action
+        cancel_id = command_id(device.id, self._clock.now_ms())
+        now_ms = self._clock.now_ms()
+        marked = await self._action_store.change(
+            action, lambda existing: _cancelling(existing, cancel_id, now_ms), existing=stored
+        )
+        if marked is not None and marked.action.status.terminal:
+            return marked.action
         lease = await read_lease(self._tables, device)
-        epoch = max(stored.action.epoch, lease.epoch if lease else 0)
+        epoch = max((marked or stored).action.epoch, lease.epoch if lease else 0)
         try:
             await self._command_sender.send(device, CancelAction(action=action), caller=caller.name, epoch=epoch)
         except BusUnavailable as error:
             raise broker_unavailable(f"{error}.") from error
-        return stored.action
+        return (marked or stored).action
 
     async def _find(self, caller: Identity, action: str) -> tuple[Device, StoredAction]:
         parts = split_command(action)
@@ -95,9 +99,9 @@ class Actions:
         return visible
 
 
-def _cancelling(action: Action, now_ms: int) -> Action:
+def _cancelling(action: Action, cancel_id: str, now_ms: int) -> Action:
     if action.status is Status.QUEUED:
         return end(action, Status.CANCELLED, "cancelled", "Cancelled while it was queued.", now_ms)
-    if action.status.terminal or action.cancel_requested:
+    if action.status.terminal or action.cancel_id:
         return action
-    return replace(action, cancel_requested=True)
+    return replace(action, cancel_id=cancel_id)

@@ -49,6 +49,7 @@ class _Undelivered(Exception):  # noqa: N818 (an outcome, not a fault)
     """The action is stored, but the broker did not confirm its command. The timer publishes it again."""
 
     def __init__(self, action: Action) -> None:
+        super().__init__(action.id)
         self.action = action
 
 

@@ -34,7 +34,7 @@ class StartOnMany:
         self._start_action = start_action
 
     async def start(
-        self, caller: Identity, requests: Mapping[str, ActionRequest], *, idempotency_key: str
+        self, caller: Identity, requests: Mapping[str, ActionRequest], *, idempotency_key: str = ""
     ) -> list[StartResult]:
         """Start ``requests[device]`` on each device; results are in the order of ``requests``.
 

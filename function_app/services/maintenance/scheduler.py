@@ -274,7 +274,7 @@ class Scheduler:
         device = await self._dispatcher.device(action)
         if device is not None:
             caller = "telescope" if is_withdrawn(action) else TIME_LIMIT
-            order, caller = CancelAction(action=action.id), action.caller if action.cancel_requested else caller
+            order, caller = CancelAction(action=action.id), action.caller if action.cancel_id else caller
             await self._command_sender.try_send(device, order, caller=caller, epoch=action.epoch)
 
     async def _delete_expired(self) -> None:

@@ -163,7 +163,7 @@ def test_the_timer_resends_commands_then_asks_for_outcomes(status: Status, after
 
 
 def test_a_cancelled_action_is_not_republished() -> None:
-    cancelled = replace(NEW, status=Status.PUBLISHED, cancel_requested=True)
+    cancelled = replace(NEW, status=Status.PUBLISHED, cancel_id="x")
     assert next_step(cancelled, NEW.created_ms + 5_000) is NextStep.CANCEL
     assert next_step(cancelled, NEW.created_ms + 10_000) is NextStep.ASK
     expired = apply_report(cancelled, AckReport(Status.EXPIRED, 1, 5, reason={"code": "expired", "message": "late"}))
