@@ -123,7 +123,15 @@ def test_a_frame_moves_while_a_pad_is_pressed(browser: Browser, laboratory: Mach
         # Joints by keys: the third is the elbow.
         page.get_by_test_id("tab-joints").click()
         elbow = float(trace.now()["qpos"]["elbow"])
-        page.keyboard.press("3")
+        selected = page.locator(".joint.selected", has=page.get_by_test_id("measured-elbow"))
+
+        def elbow_selected() -> bool:
+            # The page listens to keys only after it has drawn the tab.
+            take_control(page)
+            page.keyboard.press("3")
+            return selected.count() == 1
+
+        wait_until(elbow_selected, "the selection of the elbow")
         page.get_by_role("heading", level=1).click()
         press_key_until(page, "ArrowDown", lambda: float(trace.now()["qpos"]["elbow"]) < elbow - 0.05, "the elbow")
         press_key_until(page, "ArrowUp", lambda: float(trace.now()["qpos"]["elbow"]) > elbow - 0.02, "the elbow back")
