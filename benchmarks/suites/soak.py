@@ -30,9 +30,9 @@ _MAX_SLOPE: Final = 1.0
 _QUICK_S: Final = 48.0
 _FULL_S: Final = 3600.0
 """Shortest run whose result is published."""
-_WARM_UP: Final = 1 / 3
-_MAX_WARM_UP_S: Final = 1800.0
-"""Warm-up: this share of the run, at most this time; then caches and pools are full (17 to 20 minutes)."""
+_WARM_UP: Final = 1 / 2
+_MAX_WARM_UP_S: Final = 3600.0
+"""Warm-up: this share of the run, at most this time. Tokens, and what is stored about them, last one hour."""
 _LOG_ERROR: Final = re.compile(r"^(?:[-0-9]+ [:,0-9]+ )?((?:ERROR|CRITICAL)\b.*|Traceback .*)", re.MULTILINE)
 _PRESSURE: Final = Path("/proc/pressure/cpu")
 _ABOUT: Final = """The laboratory as `make up` starts it with {broker}: four robots and a room behind one agent. One
@@ -42,11 +42,11 @@ telemetry and reconnect with new credentials. One client signs in, reads resourc
 robot with another account, reads all lists and removes the share. `make soak` runs for 8 hours; `SOAK_HOURS` and
 `SOAK_BROKER` set another duration and broker. Ctrl-C ends a run with its report. Results of less than an hour, and all
 samples, are in `benchmarks/results/quick`."""
-_NOTE: Final = """Theil-Sen slopes over medians of one minute, after a warm-up of one third of the run (at most half
-an hour), with Sen's 95 % interval; a plus sign means growth. Own memory is anonymous memory (heap and stack);
-resident memory includes shared libraries. First and last descriptors and threads are the lowest tenth of the first
-and the last tenth of the run after warm-up, because each running script has its own. The agent's children are its
-planner and script sandboxes; their number follows the load."""
+_NOTE: Final = """Theil-Sen slopes over medians of one minute, after a warm-up of half the run (at most one hour, the
+lifetime of a token and of what is stored about it), with Sen's 95 % interval; a plus sign means growth. Own memory is
+anonymous memory (heap and stack); resident memory includes shared libraries. First and last descriptors and threads
+are the lowest tenth of the first and the last tenth of the run after warm-up, because each running script has its own.
+The agent's children are its planner and script sandboxes; their number follows the load."""
 
 _HISTORY: Final = Table(
     title="Memory: effect of changes",

@@ -16,7 +16,7 @@ class AskMovement(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True,
     parameters: dict[str, Any] = {}
 
 
-def _strict(kind: type[Struct]) -> type[Struct]:
+def _strict(kind: type[Struct]) -> type[Struct]:  # pragma: no mutate block (runs at import)
     """The kind of task as the API accepts it: agents ignore unknown fields, the API rejects misspelled ones."""
     strict = msgspec.defstruct(
         kind.__name__,

@@ -52,6 +52,13 @@ def test_a_command_is_recorded_once_and_its_terminal_ack_is_final(journal: Journ
         assert stored.status is (AckStatus.DONE if status is AckStatus.FAILED else status)
 
 
+def test_a_command_rejected_in_the_first_epoch_is_new_again_in_the_second(journal: Journal) -> None:
+    journal.begin("arm", ack("c1"), issued_ms=1)
+    reason = Reason(code="stale_epoch", message="", epoch=1)
+    journal.record(msgspec.structs.replace(ack("c1", AckStatus.FAILED, 2), reason=reason))
+    assert journal.begin("arm", ack("c1"), issued_ms=1, epoch=2) is None
+
+
 def test_a_command_rejected_because_of_its_epoch_is_new_again_with_a_higher_epoch(journal: Journal) -> None:
     journal.begin("arm", ack("c1"), issued_ms=1, epoch=1)
     rejected = msgspec.structs.replace(
@@ -159,6 +166,14 @@ def test_an_invalid_journal_file_is_named_and_not_deleted(tmp_path: Path) -> Non
         journal.open(now_ms=0)
     journal.close()
     assert path.read_bytes().startswith(b"this is not")
+
+
+def test_a_full_disk_is_an_error(journal: Journal) -> None:
+    journal._execute("PRAGMA max_page_count = 1")
+    large = StopLatch(caller="ann", reason="x" * 100_000, at_ms=1)
+    with pytest.raises(JournalError, match="is the disk full"):
+        journal.save_latch("arm", large)
+    assert journal.device("arm").latch is None
 
 
 def test_any_thread_may_write(journal: Journal) -> None:

@@ -219,6 +219,15 @@ def test_the_thread_sends_at_once_and_drains_before_it_stops(fixture: OutboxFixt
     assert fixture.stored() == ["last"]
 
 
+def test_an_idle_thread_stops_at_once(fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_PERIOD_S", 10.0)
+    fixture.outbox.start()
+    fixture.event("held")
+    eventually(lambda: fixture.outbox.stored_bytes)
+    fixture.outbox.stop()
+    assert not fixture.outbox._thread.is_alive()
+
+
 def test_a_hanging_disk_does_not_delay_the_stop(fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_STOP_S", 0.01)
     hangs, released = threading.Event(), threading.Event()

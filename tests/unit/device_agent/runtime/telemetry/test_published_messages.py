@@ -58,6 +58,7 @@ SNAPSHOT = StateSnapshot(
     load=0,
 )
 TWIN = Twin(device="arm", bodies=())
+MEASURED = Measurements(sequence=1, at_ms=9, tick_ms=1, values={"temperature_c": 20.0})
 FRAME = CameraFrame(sequence=1, tick_ms=2, width=3, height=4, jpeg=b"jpeg")
 Sent = tuple[str, bytes, dict[str, Any]]
 
@@ -173,9 +174,11 @@ def test_a_connection_publishes_the_twin_and_makes_the_state_due(fixture: Fixtur
 
 def test_the_state_has_all_data_of_the_device(fixture: Fixture, clock: SimpleNamespace) -> None:
     fixture.publisher.publish_frame("front", FRAME)
+    fixture.publisher.publish_telemetry("climate", MEASURED)
     clock.now_s += WINDOW_S
     for _ in range(20):
         fixture.publisher.publish_frame("front", FRAME)
+        fixture.publisher.publish_telemetry("climate", MEASURED)
     fixture.publisher.publish_state(SNAPSHOT)
     (state,) = fixture.states()
     lease = LeaseState(
@@ -198,7 +201,7 @@ def test_the_state_has_all_data_of_the_device(fixture: Fixture, clock: SimpleNam
         faults=SNAPSHOT.faults,
         restrictions=SNAPSHOT.restrictions,
         stiffness={"elbow": 0.5},
-        rates_hz={"cam/front": 20 / WINDOW_S},
+        rates_hz={"cam/front": 20 / WINDOW_S, "tele/climate": 20 / WINDOW_S},
     )
     assert fixture.sent[-1][2] == {"qos": 1, "retain": True}
 
@@ -281,9 +284,8 @@ def test_a_state_that_could_not_be_sent_is_published_again(fixture: Fixture) -> 
 @pytest.mark.parametrize("accepts", [True, False])
 def test_telemetry_is_sent_once_and_offered_to_the_outbox(fixture: Fixture, accepts: bool) -> None:
     fixture.accepts = accepts
-    measured = Measurements(sequence=1, at_ms=9, tick_ms=1, values={"temperature_c": 20.0})
-    fixture.publisher.publish_telemetry("climate", measured)
-    payload = codec.encode(measured)
+    fixture.publisher.publish_telemetry("climate", MEASURED)
+    payload = codec.encode(MEASURED)
     assert fixture.sent == ([(BASE + "tele/climate", payload, {"qos": 0})] if accepts else [])
     options = {"at_ms": 9, "sent": accepts, "now_s": 1000.0}
     assert fixture.stored == [(BASE + "late/climate", payload, options)]

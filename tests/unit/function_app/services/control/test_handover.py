@@ -41,6 +41,9 @@ def test_the_lease_is_free_if_the_permission_of_the_requester_ends_during_the_ha
     assert refusal["detail"].startswith(f"{request['requester']} ")
     assert "free now" in refusal["detail"]
     assert anna.get(lease).json()["lease"] is None
+    cloud.run(cloud.functions.control_events.publish(robot.device))
+    (event, *_) = anna.get(f"/devices/{robot.device}/events").json()["items"]
+    assert (event["kind"], event["data"]["reason"]) == ("control-ended", "unshared")
     assert [grant.epoch for grant in robot.received(GrantLease)] == [1], "the requester never had control"
     assert [command.epoch for command in robot.received(ReleaseLease)] == [3], "both epochs are fenced"
 
