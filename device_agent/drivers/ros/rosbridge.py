@@ -1,0 +1,119 @@
+"""Channel to a rosbridge server: JSON messages in WebSocket frames.
+
+The library's own connection would start threads that the agent does not supervise, so its protocol without a
+connection is used. Frames to send are built without shared state, so that no thread waits for another one.
+"""
+
+import contextlib
+import select
+import socket
+import time
+from collections.abc import Sequence
+
+from websockets.client import ClientProtocol
+from websockets.exceptions import WebSocketException
+from websockets.frames import Frame, Opcode
+from websockets.protocol import State
+from websockets.uri import parse_uri
+
+from device_agent.ports.driver import UnreachableError
+
+_TIMEOUT_S = 2.0
+"""Time to connect, and for the response [s]."""
+_CHECK_S = 0.1
+_DEFAULT_PORT = 9090
+_MAX_MESSAGE = 1 << 20
+_DATA = (Opcode.TEXT, Opcode.BINARY, Opcode.CONT)
+
+
+class RosbridgeChannel:
+    """A connected WebSocket. See ``Channel``.
+
+    Args:
+        address: ``host`` or ``host:port``.
+
+    Raises:
+        UnreachableError: There is no rosbridge server.
+    """
+
+    def __init__(self, address: str) -> None:
+        host, _, port = address.partition(":")
+        self.where = f"rosbridge at {host}:{port or _DEFAULT_PORT}"
+        self._protocol = ClientProtocol(parse_uri(f"ws://{host}:{port or _DEFAULT_PORT}/"), max_size=_MAX_MESSAGE)
+        self._parts: list[bytes] = []
+        try:
+            self._socket = socket.create_connection((host, int(port or _DEFAULT_PORT)), timeout=_TIMEOUT_S)
+        except (OSError, OverflowError) as error:
+            raise UnreachableError(f"no connection to {self.where}: {error}; is rosbridge running?") from error
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._shake_hands()
+            self._socket.setblocking(False)
+        except (OSError, WebSocketException) as error:
+            self._socket.close()
+            raise UnreachableError(f"{self.where} is no rosbridge server: {error}; check the port") from error
+
+    def send(self, message: bytes) -> None:
+        """See ``Channel``."""
+        self._write(Frame(Opcode.TEXT, message).serialize(mask=True))
+
+    def receive(self) -> Sequence[bytes]:
+        """See ``Channel``."""
+        try:
+            if not select.select([self._socket], [], [], _CHECK_S)[0]:
+                return self._messages()
+            data = self._socket.recv(65536)
+        except BlockingIOError:
+            return ()
+        except ValueError as error:
+            raise ConnectionError("the connection was closed") from error
+        if not data:
+            raise ConnectionError("the server has closed the connection")
+        self._protocol.receive_data(data)
+        for answer in self._protocol.data_to_send():
+            self._write(answer)
+        messages = self._messages()
+        if self._protocol.state is not State.OPEN and not messages:
+            raise ConnectionError("the server has ended the connection, or sent invalid data")
+        return messages
+
+    def disconnect(self) -> None:
+        """See ``Channel``."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """See ``Channel``."""
+        self._socket.close()
+
+    def _shake_hands(self) -> None:
+        protocol, end_s = self._protocol, time.monotonic() + _TIMEOUT_S
+        protocol.send_request(protocol.connect())
+        self._socket.sendall(b"".join(protocol.data_to_send()))
+        while protocol.state is State.CONNECTING:
+            data = self._socket.recv(65536)
+            if data:
+                protocol.receive_data(data)
+            else:
+                protocol.receive_eof()
+            if protocol.handshake_exc is not None:
+                raise protocol.handshake_exc
+            if not data or time.monotonic() > end_s:
+                raise TimeoutError("no response")
+
+    def _messages(self) -> list[bytes]:
+        """Whole messages of the frames that have arrived."""
+        messages = []
+        for event in self._protocol.events_received():
+            if isinstance(event, Frame) and event.opcode in _DATA:
+                self._parts.append(bytes(event.data))
+                if event.fin:
+                    messages.append(b"".join(self._parts))
+                    self._parts = []
+        return messages
+
+    def _write(self, data: bytes) -> None:
+        """Write without waiting. After a part of a frame nothing else could be written, so the channel is lost."""
+        if data and self._socket.send(data, socket.MSG_DONTWAIT) < len(data):
+            self.disconnect()
+            raise ConnectionError("the other end does not receive; check the network")

@@ -1,0 +1,71 @@
+"""The driver for ROS fulfils the driver contract, at a robot behind an emulated rosbridge server."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from device_agent import drivers
+from device_agent.drivers.ros import driver as ros_driver
+from device_agent.drivers.testing.driver_contract import DriverContract
+from device_agent.ports.driver import Driver
+from device_agent.protocol.manifests import robot_type as robot_types
+from device_agent.protocol.manifests.robot_type import RobotType
+from tests.harness.paths import ROBOTS
+from tests.harness.robots.ros.peer import RosPeer
+
+
+class TestRos1Arm(DriverContract):
+    """An arm with a trajectory controller."""
+
+    type_name = "ur5"
+    ros, kind, stamped = 1, "trajectory", False
+
+    @pytest.fixture(autouse=True)
+    def _short_start(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(ros_driver, "_START_S", 1.0)
+
+    @pytest.fixture
+    def robot_type(self) -> RobotType:
+        return robot_types.load(ROBOTS / self.type_name)
+
+    @pytest.fixture
+    def peer(self, robot_type: RobotType) -> Iterator[RosPeer]:
+        peer = RosPeer(robot_type, ros=self.ros, kind=self.kind, stamped=self.stamped)
+        yield peer
+        peer.close()
+
+    @pytest.fixture
+    def driver(self, robot_type: RobotType, peer: RosPeer) -> Iterator[Driver]:
+        driver = drivers.load("ros")(robot_type, ROBOTS / self.type_name, peer.options(), "robot")
+        yield driver
+        driver.close()
+        assert not peer.server.errors
+        assert not peer.robot.rejected
+
+
+class TestRos2Base(TestRos1Arm):
+    """A robot on wheels with a head."""
+
+    type_name = "qbo"
+    ros, stamped = 2, True
+
+
+@pytest.mark.long
+class TestPositionController(TestRos1Arm):
+    """A controller that follows positions."""
+
+    kind = "positions"
+
+
+@pytest.mark.long
+class TestJointStateCommands(TestRos1Arm):
+    """A controller that takes JointState."""
+
+    kind = "joint_state"
+
+
+@pytest.mark.long
+class TestActionGoals(TestRos1Arm):
+    """An action server for FollowJointTrajectory."""
+
+    kind = "goal"
