@@ -1,6 +1,7 @@
 """A connection to ROS: topics that are received and published, as messages of the rosbridge protocol, version 2.
 
-A ``Channel`` transports the messages: ``rosbridge.py`` over a WebSocket to a rosbridge server.
+A ``Channel`` transports the messages: ``rosbridge.py`` over a WebSocket to a rosbridge server, ``rospy_channel.py``
+over a socket to a bridge process.
 """
 
 import logging

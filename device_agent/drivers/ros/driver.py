@@ -1,5 +1,6 @@
 """Driver of a robot with ROS. ``device_agent/ports/driver.py`` documents each method."""
 
+import re
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -8,7 +9,7 @@ from typing import Any
 
 from device_agent.drivers.command_limits import limit_positions
 from device_agent.drivers.ros import messages
-from device_agent.drivers.ros.connection import Connection, Subscription
+from device_agent.drivers.ros.connection import Channel, Connection, Subscription
 from device_agent.drivers.ros.joint_commands import JointCommands, Publication
 from device_agent.drivers.ros.joint_states import JointStates, Measurement
 from device_agent.drivers.ros.messages import Dialect
@@ -16,6 +17,7 @@ from device_agent.drivers.ros.options import Options
 from device_agent.drivers.ros.pictures import Pictures
 from device_agent.drivers.ros.robot_status import RobotStatus
 from device_agent.drivers.ros.rosbridge import RosbridgeChannel
+from device_agent.drivers.ros.rospy_channel import RospyChannel
 from device_agent.ports.driver import DriverError, DriverFault, Observation, UnreachableError
 from device_agent.ports.sensor import Frame
 from device_agent.protocol import Twin
@@ -64,7 +66,7 @@ class RosDriver:
         self.close()
         self._states, self._status = self._new_states(), RobotStatus(self._options)
         connection = Connection(
-            RosbridgeChannel(self._options.address),
+            self._open(),
             subscriptions=self._subscriptions(self._states, self._status),
             advertised=self._advertised(),
             device=self._device,
@@ -128,6 +130,13 @@ class RosDriver:
             connection.close()
 
     # ------------------------------------------------------------ topics
+
+    def _open(self) -> Channel:
+        options = self._options
+        if options.connection == "rosbridge":
+            return RosbridgeChannel(options.address)
+        node = "telescope_" + re.sub(r"\W", "_", self._device)
+        return RospyChannel(python=options.python, folders=options.python_folders, master=options.master, node=node)
 
     def _subscriptions(self, states: JointStates, status: RobotStatus) -> list[Subscription]:
         options, subscriptions = self._options, []

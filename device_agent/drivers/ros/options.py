@@ -1,6 +1,6 @@
 """Options of the driver ``ros``: ``[devices.options]``. They map topics; nothing about a robot is in the code."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import msgspec
@@ -70,7 +70,11 @@ class Options(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All options.
 
     Attributes:
+        connection: How ROS is reached: through a rosbridge server, or with ``rospy`` in a process of its own (ROS 1).
         address: Host and port of rosbridge.
+        master: Address of the ROS master, for ``rospy``.
+        python: Interpreter that has ``rospy``.
+        python_folders: Folders of ROS's Python packages, if the interpreter does not find them.
         ros: Version of ROS: 1 or 2.
         simulated: Whether the robot is a simulation, for example Gazebo. Operators see it.
         joint_states: Topic of JointState.
@@ -84,7 +88,11 @@ class Options(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         safety: Topics that tell whether the robot may move.
     """
 
+    connection: Literal["rosbridge", "rospy"] = "rosbridge"
     address: Annotated[str, Meta(pattern=r"^[^:/\s]+(:[0-9]{1,5})?$")] = "127.0.0.1:9090"
+    master: Annotated[str, Meta(pattern=r"^http://[^:/\s]+:[0-9]{1,5}/?$")] = "http://127.0.0.1:11311"
+    python: str = "/usr/bin/python3"
+    python_folders: tuple[str, ...] = ()
     ros: Literal[1, 2] = 1
     simulated: bool = False
     joint_states: Topic = "/joint_states"
@@ -129,6 +137,14 @@ def _check(options: Options, robot_type: RobotType) -> None:
     names = [options.names.get(joint, joint) for joint in joints]
     if len(set(names)) != len(names):
         raise DriverError("option 'names': two joints have the same name in ROS")
+    _check_command(options, robot_type, names)
+    if options.connection == "rospy" and options.ros != 1:
+        raise DriverError("option 'connection': use \"rosbridge\" with ROS 2")
+    if (options.base is None) != (robot_type.base is None):
+        raise DriverError(f"option 'base' is for robot types with a base; '{robot_type.type}' and the options differ")
+
+
+def _check_command(options: Options, robot_type: RobotType, names: Sequence[str]) -> None:
     command = options.command
     if command.kind == "positions":
         if sorted(command.joints) != sorted(names):
@@ -144,5 +160,3 @@ def _check(options: Options, robot_type: RobotType) -> None:
             "option 'command.horizon_ms' must be at least two command intervals: "
             f"two periods of the robot type ({robot_type.period_ms} ms), and twice 1/rate_hz"
         )
-    if (options.base is None) != (robot_type.base is None):
-        raise DriverError(f"option 'base' is for robot types with a base; '{robot_type.type}' and the options differ")

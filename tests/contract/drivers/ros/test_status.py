@@ -121,9 +121,11 @@ def test_other_data_are_no_picture(cut: int) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"speed": 1}, "driver 'ros' has no option 'speed'; it has: address, ros, simulated"),
+        ({"speed": 1}, "driver 'ros' has no option 'speed'; it has: connection, address, master"),
         ({"command": {}}, r"missing required field `topic` - at `\$.command`"),
         ({"command": {"topic": "/c", "speed": 1}}, r"unknown field `speed` - at `\$.command`"),
+        ({"connection": "rospy", "ros": 2}, 'use "rosbridge" with ROS 2'),
+        ({"master": "robot"}, "master"),
         ({"ros": 3}, "Invalid enum value 3"),
         ({"address": "robot:port"}, "address"),
         ({"names": {"thumb": "thumb_joint"}}, "robot type 'ur5' has no 'thumb'; it has: shoulder_pan"),
