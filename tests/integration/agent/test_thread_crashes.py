@@ -87,9 +87,12 @@ class MovingAgent(AgentProcess):
         self.client.close()
 
     def threads(self) -> dict[str, SupervisedThread]:
-        """The agent's threads by name; that of the running action is ``action``."""
+        """The agent's threads by name; that of the running action is ``action``.
+
+        A thread of the previous agent may still wait for an image.
+        """
         return {thread.name.partition("-c")[0] if "action" in thread.name else thread.name: thread
-                for thread in threads.watched()}  # fmt: skip
+                for thread in threads.watched() if thread._thread not in self.others}  # fmt: skip
 
     def check(self) -> None:
         snapshot = self.world.snapshot()
