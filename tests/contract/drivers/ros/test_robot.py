@@ -223,8 +223,14 @@ def test_halting_brakes_also_for_delayed_commands(driver: RosDriver, peer: RosPe
     assert connection is not None
     publish, target = connection.publish, [value + 2.0 for value in peer.joint_positions()]
 
+    braking: list[Any] = []
+
+    def brake(publication: Any) -> None:
+        braking.append(publication)
+        publish(publication)
+
     def halted_meanwhile(publication: Any) -> None:
-        connection.publish = publish  # type: ignore[method-assign]
+        connection.publish = brake  # type: ignore[method-assign]
         driver.halt()  # of the supervisor, while this thread sends
         publish(publication)
 
@@ -232,6 +238,7 @@ def test_halting_brakes_also_for_delayed_commands(driver: RosDriver, peer: RosPe
     halted_s = peer.robot.joints.time_s
     with pytest.raises(DriverError, match="was halted"):
         until(lambda: not driver.send(target))
+    assert len(braking) == 2, "the second follows the delayed command"
     rest_s = peer.wait(lambda robot: robot.joints.at_rest)
     assert rest_s - halted_s < REST_S
     before = peer.joint_positions()
