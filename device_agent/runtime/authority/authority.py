@@ -40,6 +40,7 @@ class Authority:
         changed: Set when epochs or latch changed and must be journalled; the command processor clears it.
         latch: The Stop latch.
         fault: Error message of the driver.
+        device_stopped: Whether ``fault`` is a stop of the device itself, which prevents the reset of Stop.
         reservation: Reservation of the running action.
         restrictions: Speed restrictions of the room.
     """
@@ -53,6 +54,7 @@ class Authority:
         self.changed = threading.Event()
         self.latch = latch
         self.fault: str | None = None
+        self.device_stopped = False
         self.reservation: Reservation | None = None
         self.restrictions = Restrictions()
 
@@ -123,18 +125,25 @@ class Authority:
         self.end(Refused("stopped", f"stopped by {self.latch.caller}"))
 
     def reset_stop(self) -> None:
-        """Release the latch. Every lease so far ends."""
+        """Release the latch. Every lease so far ends.
+
+        Raises:
+            Refused: The device has stopped itself; the latch remains.
+        """
         self.end(Refused("lease_lost", "Stop was reset; take control again"))
+        if self.device_stopped:
+            raise Refused("device_stopped", f"the device has stopped itself: {self.fault}")
         self.latch = None
 
-    def set_fault(self, message: str) -> None:
-        """Record that the driver failed, and hold."""
-        self.fault = message
+    def set_fault(self, message: str, *, device_stopped: bool = False) -> None:
+        """Record that the driver failed, or that the device has stopped itself, and hold."""
+        self.fault, self.device_stopped = message, device_stopped
         self.end(Refused("fault", message))
 
     def clear_fault(self) -> bool:
         """Record that the driver works again. Returns False if it had not failed."""
-        failed, self.fault = self.fault is not None, None
+        failed = self.fault is not None
+        self.fault, self.device_stopped = None, False
         return failed
 
     def end(self, why: Refused, lease: Lease | None = None) -> None:

@@ -113,7 +113,8 @@ class Controller:
         """Release the latch. Nothing resumes: every lease up to ``epoch``, that of the reset, has ended.
 
         Raises:
-            Refused: The epoch is stale: a late or repeated reset must not release a later latch.
+            Refused: The epoch is stale: a late or repeated reset must not release a later latch. Or the device has
+                stopped itself.
         """
         with self._lock:
             self._fence(epoch)
@@ -144,12 +145,12 @@ class Controller:
     def follow_device_stop(self, latch: StopLatch, position_rad: Sequence[float]) -> None:
         """Latch Stop, and be at rest at ``position_rad``, shape (n,) [rad], until ``clear_fault``.
 
-        The device has stopped itself for the reason of ``latch``. If Stop is reset before, it is latched again.
+        The device has stopped itself for the reason of ``latch``. Until then Stop cannot be reset.
         """
         with self._lock:
             authority = self._state.authority
-            if authority.fault != latch.reason:
-                authority.set_fault(latch.reason)
+            if not (authority.device_stopped and authority.fault == latch.reason):
+                authority.set_fault(latch.reason, device_stopped=True)
             if authority.latch is None:
                 authority.stop(latch)
             self._state.goals.start_at(position_rad)

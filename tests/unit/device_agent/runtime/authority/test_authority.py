@@ -96,6 +96,22 @@ def test_a_stop_is_latched_and_recorded() -> None:
     assert fixture.authority.latch is None
 
 
+def test_stop_is_not_reset_while_the_device_has_stopped_itself() -> None:
+    fixture = Fixture(latch=LATCH)
+    fixture.grant(3)
+    fixture.authority.set_fault("it hit something", device_stopped=True)
+    with refuses("device_stopped"):
+        fixture.authority.reset_stop()
+    assert fixture.authority.latch == LATCH
+    fixture.authority.set_fault("no answer")  # the device is lost: whether it has stopped itself is unknown
+    fixture.authority.reset_stop()
+    fixture.authority.stop(LATCH)
+    fixture.authority.set_fault("it hit something", device_stopped=True)
+    fixture.authority.clear_fault()
+    fixture.authority.reset_stop()
+    assert fixture.authority.latch is None
+
+
 @pytest.mark.parametrize(
     ("first", "second", "shown"),
     [(False, False, "bob"), (False, True, "cat"), (True, False, "bob"), (True, True, "bob")],

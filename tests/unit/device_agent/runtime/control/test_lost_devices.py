@@ -123,9 +123,13 @@ def test_a_device_that_stops_itself_latches_stop_and_receives_no_commands(
     eventually(lambda: harness.telemetry().position_rad == (0.5, -0.5))
     assert harness.telemetry().mode is Mode.FAULT
     assert harness.telemetry().commanded_rad == (0.5, -0.5)
-    harness.done(ResetStop(), epoch=2)
-    eventually(lambda: harness.device._controller.latch is not None)
-    assert driver.sent == sent, "Stop cannot be reset while the device has stopped itself"
+    refusal = harness.failed(ResetStop(), epoch=2)
+    assert refusal.code == "device_stopped"
+    assert PROTECTIVE_STOP.message in refusal.message
+    assert state(harness).stop == latch
+    assert not harness.events("stop-reset")
+    assert harness.failed(MOVE, epoch=2).code == "lease_ended", "the epoch of a rejected reset has ended too"
+    assert driver.sent == sent
     driver.present = ()
     eventually(lambda: harness.telemetry().mode is Mode.STOPPED)
     assert harness.failed(MOVE, epoch=3).code == "stopped"
