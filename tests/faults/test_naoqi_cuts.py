@@ -74,7 +74,7 @@ def cut(driver: NaoqiDriver, kind: str) -> float:
     """End the commands; returns when."""
     cut_s = time.monotonic()
     if kind == "agent ends":
-        driver._connection._link.shutdown(2)  # type: ignore[union-attr] # as the kernel does for a process that ends
+        driver._connection._bridge.disconnect()  # type: ignore[union-attr] # as the kernel does for a process that ends
     elif kind == "stop":
         driver.halt()
     return cut_s

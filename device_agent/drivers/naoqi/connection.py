@@ -3,8 +3,6 @@
 import contextlib
 import itertools
 import logging
-import socket
-import subprocess
 import threading
 import time
 from dataclasses import dataclass
@@ -13,6 +11,7 @@ from typing import Any
 
 import msgspec
 
+from device_agent.drivers.bridge_process import BridgeProcess
 from device_agent.ports.driver import UnreachableError
 from device_agent.ports.skills import SkillError
 from device_agent.ports.threads import SupervisedThread
@@ -21,8 +20,6 @@ _START_S = 8.0
 """Time until the first measurement [s]; it includes the start of the bridge's Python."""
 _OLD_S = 1.0
 _END_S = 2.0
-_CHECK_S = 0.1
-_MAX_LINE = 65536
 _BRIDGE = Path(__file__).with_name("bridge.py")
 _log = logging.getLogger(__name__)
 
@@ -110,18 +107,7 @@ class Connection:
         self._task_changed = threading.Condition()
         self.status: Status | None = None
         self.velocity_rad_s = (0.0,) * self._count
-        self._link, theirs = socket.socketpair()
-        try:
-            # A new session, so that Ctrl-C in a terminal does not end the bridge before it has stopped the robot.
-            self._process = subprocess.Popen(  # noqa: S603 (the interpreter is named in the local configuration)
-                [settings.python, "-I", str(_BRIDGE)], stdin=theirs.fileno(), start_new_session=True
-            )
-        except OSError as error:
-            self._link.close()
-            raise UnreachableError(f"the Python of the NAOqi bridge cannot be started: {error}") from error
-        finally:
-            theirs.close()
-        self._link.settimeout(_CHECK_S)
+        self._bridge = BridgeProcess("NAOqi bridge", settings.python, _BRIDGE)
         self._thread = SupervisedThread(
             self._receive, name=f"{device}-receiver", part="receiver of the driver", device=device
         )
@@ -156,15 +142,11 @@ class Connection:
         Raises:
             UnreachableError: The bridge has ended or hangs.
         """
-        data = msgspec.json.encode(command) + b"\n"
         try:
-            sent = self._link.send(data, socket.MSG_DONTWAIT)
+            self._bridge.send(msgspec.json.encode(command))
         except OSError as error:
             self._closed.set()
             raise UnreachableError(f"the NAOqi bridge has ended or hangs: {error}") from error
-        if sent < len(data):
-            self._closed.set()
-            raise UnreachableError("the NAOqi bridge hangs")
 
     def start_task(self, **task: Any) -> int:
         """Start a task that takes time; returns its number for ``wait_for``.
@@ -208,31 +190,16 @@ class Connection:
     def close(self) -> None:
         """End the bridge, which stops the robot. May be called repeatedly."""
         self._closed.set()
-        with contextlib.suppress(OSError):
-            self._link.shutdown(socket.SHUT_RDWR)
+        self._bridge.disconnect()
         self._thread.join(_END_S)
-        self._link.close()
-        try:
-            self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._bridge.close()
 
     def _receive(self) -> None:
-        buffer = b""
-        while not self._closed.is_set():
-            try:
-                received = self._link.recv(_MAX_LINE)
-            except TimeoutError:
-                continue
-            except OSError:
-                break
-            if not received or len(buffer) > _MAX_LINE:
-                break
-            *lines, buffer = (buffer + received).split(b"\n")
-            for line in lines:
-                with contextlib.suppress(msgspec.DecodeError):
-                    self._accept(self._decoder.decode(line))
+        with contextlib.suppress(OSError):
+            while not self._closed.is_set():
+                for line in self._bridge.receive():
+                    with contextlib.suppress(msgspec.DecodeError):
+                        self._accept(self._decoder.decode(line))
         self._closed.set()
         self._ready.set()
         with self._task_changed:

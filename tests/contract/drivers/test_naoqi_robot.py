@@ -147,7 +147,7 @@ def test_a_walk_starts_only_while_the_robot_stands(driver: NaoqiDriver, peer: Na
 def test_an_ended_bridge_is_a_lost_device_and_reconnecting_stops_the_walk(driver: NaoqiDriver, peer: NaoPeer) -> None:
     assert driver._connection is not None
     until(lambda: walks(driver, peer))
-    driver._connection._process.kill()
+    driver._connection._bridge.process.kill()
     until(lambda: lost(driver))
     with pytest.raises(DriverError):
         driver.send(HOME)
@@ -157,7 +157,7 @@ def test_an_ended_bridge_is_a_lost_device_and_reconnecting_stops_the_walk(driver
 
 def test_a_hung_bridge_is_a_lost_device_and_is_replaced(driver: NaoqiDriver, peer: NaoPeer) -> None:
     assert driver._connection is not None
-    process = driver._connection._process
+    process = driver._connection._bridge.process
     until(lambda: walks(driver, peer))
     os.kill(process.pid, signal.SIGSTOP)
     until(lambda: lost(driver))

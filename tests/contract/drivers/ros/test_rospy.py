@@ -146,7 +146,7 @@ def test_a_master_that_was_replaced_is_noticed(system: RosSystem, robot: RosRobo
     driver.connect()
     connection = driver._connection
     assert connection is not None
-    process = connection._channel._process  # type: ignore[attr-defined]
+    process = connection._channel.process  # type: ignore[attr-defined]
     os.kill(process.pid, signal.SIGSTOP)
     system.stop_master()
     system.start_master()
@@ -162,7 +162,7 @@ def test_a_bridge_that_crashes_ends_the_motion(robot: RosRobot, driver: RosDrive
     move_until(driver, robot, is_fast)
     connection = driver._connection
     assert connection is not None
-    process = connection._channel._process  # type: ignore[attr-defined]
+    process = connection._channel.process  # type: ignore[attr-defined]
     process.kill()
     with pytest.raises(UnreachableError, match="is lost"):
         move_until(driver, robot, lambda _: False)
