@@ -43,12 +43,18 @@ class BridgeProcess:
             theirs.close()
 
     def send(self, message: bytes) -> None:
-        """Send one message. Never blocks.
+        """Send one message. Never blocks. After an error the connection is closed.
 
         Raises:
-            OSError: The bridge has ended or hangs.
+            ConnectionError: The bridge has ended or hangs.
         """
-        if self._link.send(message + b"\n", socket.MSG_DONTWAIT) < len(message) + 1:
+        try:
+            sent = self._link.send(message + b"\n", socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            sent = 0
+        except OSError as error:
+            raise self._ended() from error
+        if sent <= len(message):
             self.disconnect()
             raise ConnectionError(f"the {self._name} hangs")
 
@@ -56,16 +62,16 @@ class BridgeProcess:
         """Messages that have arrived, after at most 0.1 s. Only one thread may call it.
 
         Raises:
-            OSError: The bridge has ended, or the connection was closed.
+            ConnectionError: The bridge has ended, or the connection was closed.
         """
         try:
             if not select.select([self._link], [], [], _CHECK_S)[0]:
                 return ()
-        except ValueError as error:
-            raise ConnectionError("the connection was closed") from error
-        received = self._link.recv(1 << 16)
+            received = self._link.recv(1 << 16)
+        except (OSError, ValueError) as error:
+            raise self._ended() from error
         if not received or len(self._buffer) > _MAX_LINE:
-            raise ConnectionError(f"the {self._name} has ended")
+            raise self._ended()
         *lines, self._buffer = (self._buffer + received).split(b"\n")
         return lines
 
@@ -83,3 +89,6 @@ class BridgeProcess:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
+
+    def _ended(self) -> ConnectionError:
+        return ConnectionError(f"the {self._name} has ended")

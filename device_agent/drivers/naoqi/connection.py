@@ -144,9 +144,9 @@ class Connection:
         """
         try:
             self._bridge.send(msgspec.json.encode(command))
-        except OSError as error:
+        except ConnectionError as error:
             self._closed.set()
-            raise UnreachableError(f"the NAOqi bridge has ended or hangs: {error}") from error
+            raise UnreachableError(str(error)) from error
 
     def start_task(self, **task: Any) -> int:
         """Start a task that takes time; returns its number for ``wait_for``.
@@ -195,7 +195,7 @@ class Connection:
         self._bridge.close()
 
     def _receive(self) -> None:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(ConnectionError):
             while not self._closed.is_set():
                 for line in self._bridge.receive():
                     with contextlib.suppress(msgspec.DecodeError):
