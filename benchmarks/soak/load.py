@@ -183,7 +183,7 @@ class Load:
     def _move(self, http: httpx.Client, device: dict[str, Any], request: dict[str, Any]) -> None:
         action = self._start(http, device, request, "done")
         if action["status"] != "done":
-            raise RuntimeError(f"{request['name']} ended as {action['status']}: {action.get('detail')}")
+            raise RuntimeError(f"{request['name']} ended as {action['status']}: {action['reason']}")
         self.count("actions")
 
     def _start(self, http: httpx.Client, device: dict[str, Any], request: dict[str, Any], until: str) -> dict[str, Any]:
