@@ -143,8 +143,11 @@ function describe(session: DeviceSession): [Shown, string] {
       return ["taking", texts.control.taking];
     case "held":
       return ["mine", state.confirmed ? texts.control.mine : texts.control.unconfirmed];
-    case "lost":
-      return ["lost", texts.control.lost(reason === "" ? lostReason(device, state.epoch, name, state.reason) : texts.control.tookOver(name, reason))];
+    case "lost": {
+      // Until the page knows the next lease, the holder is this page's own.
+      const next = holder !== null && holder.epoch > state.epoch ? name : "";
+      return ["lost", texts.control.lost(reason === "" ? lostReason(device, state.epoch, next, state.reason) : texts.control.tookOver(name, reason))];
+    }
     case "refused":
       return ["refused", texts.control.refused(state.reason)];
     case "handed":

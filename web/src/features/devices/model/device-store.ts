@@ -39,6 +39,7 @@ interface MeasuredValues extends Timed<Measurements> {
 interface LeaseHolder {
   name: string;
   account: string;
+  epoch: number;
   mine: boolean;
 }
 
@@ -161,9 +162,9 @@ export class DeviceStore {
     const reported = this.live.value ? this.#state.value : null;
     const current = lease !== null && toPageClock(Date.parse(lease.expires_at)) > clock.value ? lease : null;
     if (reported !== null && (current === null || current.epoch < reported.epoch)) {
-      return reported.lease === null ? null : { name: reported.lease.holder, account: "", mine: false };
+      return reported.lease === null ? null : { name: reported.lease.holder, account: "", epoch: reported.epoch, mine: false };
     }
-    return current === null ? null : { name: current.holder, account: current.holder_account, mine: current.mine };
+    return current === null ? null : { name: current.holder, account: current.holder_account, epoch: current.epoch, mine: current.mine };
   });
 
   /**
