@@ -221,3 +221,16 @@ def test_a_lease_that_the_device_has_ended_does_not_stop_the_queue(
     robot.report(running, AckStatus.DONE)
     assert started(anna, waiting)
     assert anna.action(waiting)["epoch"] == epoch + 1
+
+
+@pytest.mark.parametrize("first", ["missing", "ended"])
+def test_a_first_place_without_a_waiting_action_is_removed(
+    cloud: Cloud, anna: Person, robot: Robot, running: str, first: str
+) -> None:
+    waiting = queued(anna, robot.device)
+    end_silently(cloud, running)
+    stale = running if first == "ended" else f"{robot.device}-{MISSING}"
+    change_queue(cloud, robot.device, actions=[stale, waiting])
+    assert check(cloud, robot.device) is False
+    assert sent(robot) == [running, waiting]
+    assert control_rows(cloud, robot.device)["now:queue"]["actions"] == []
