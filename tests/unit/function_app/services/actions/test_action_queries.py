@@ -36,13 +36,14 @@ def test_an_unknown_action_is_named(anna: Person, robot: Robot, action: str) -> 
 def test_a_second_cancel_keeps_the_first_command(cloud: Cloud, anna: Person, robot: Robot, running: str) -> None:
     anna.post(f"/actions/{running}/cancel")
     first = row(cloud, robot, running)["cancel_id"]
-    assert isinstance(first, str) and first.startswith(f"{robot.device}-")
+    assert isinstance(first, str)
+    assert first.startswith(f"{robot.device}-")
     cloud.clock.advance(1)
     assert anna.post(f"/actions/{running}/cancel").status_code == 202
     assert row(cloud, robot, running)["cancel_id"] == first
 
 
-def test_cancel_uses_the_epoch_of_a_newer_lease(cloud: Cloud, anna: Person, robot: Robot, running: str) -> None:
+def test_cancel_uses_the_epoch_of_a_newer_lease(anna: Person, robot: Robot, running: str) -> None:
     older = anna.action(running)["epoch"]
     newer = anna.take_lease(robot.device).json()["epoch"]
     assert newer > older
@@ -66,9 +67,9 @@ def test_cancel_without_a_broker_says_so_and_is_remembered(
 ) -> None:
     broker.reachable = False
     detail = problem(anna.post(f"/actions/{running}/cancel"), 503, "broker-unavailable")["detail"]
-    assert "broker" in detail and detail.endswith(".")
+    assert "broker" in detail
+    assert detail.endswith(".")
     assert row(cloud, robot, running)["cancel_id"] != ""
     broker.reachable = True
     robot.report(running, AckStatus.CANCELLED)
     assert anna.action(running)["status"] == "cancelled"
-

@@ -2,14 +2,17 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 from unittest import mock
 
 import pytest
 
-from device_agent.protocol import AckStatus, Mode, State
+from device_agent.protocol import AckStatus, Mode, RunMovement, State
 from function_app.domain.actions.action import RETRY_MS, Action, Status, end
+from function_app.domain.actions.queue import UNPAIRED
 from function_app.ports.tables import Conflict
+from function_app.services.actions.dispatcher import PermissionEnded
 from function_app.services.devices.control_rows import read_control_rows
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
@@ -171,6 +174,12 @@ def test_a_started_action_occupies_slot_and_lease_and_leaves_the_queue(
     problem(elsewhere.take_lease(robot.device), 409, "lease-held")
     assert rows["now:lease"]["action"] == waiting
     assert rows["now:lease"]["epoch"] == anna.action(waiting)["epoch"]
+    taken = rows[f"event:control-taken-{rows['now:lease']['epoch']}"]
+    assert (taken["owner"], taken["by"]["account"], taken["event"]["data"]["action"]) == (
+        anna.account,
+        anna.account,
+        waiting,
+    )
 
 
 def test_the_timer_publishes_a_started_action_that_the_broker_did_not_confirm(
@@ -234,3 +243,23 @@ def test_a_first_place_without_a_waiting_action_is_removed(
     assert check(cloud, robot.device) is False
     assert sent(robot) == [running, waiting]
     assert control_rows(cloud, robot.device)["now:queue"]["actions"] == []
+
+
+def test_a_queued_movement_is_sent_with_its_parameters(anna: Person, robot: Robot, running: str) -> None:
+    assert anna.put("/robot-types/ur5/movements/mine", {"source": "robot.home()"}).status_code == 201
+    request = {"kind": "run_movement", "name": "mine", "parameters": {"note": "x", "list": [1, 2.5]}}
+    waiting = queued(anna, robot.device, request=request)
+    robot.report(running, AckStatus.DONE)
+    (command,) = robot.received(RunMovement)
+    assert isinstance(command.request, RunMovement)
+    assert (command.id, command.request.parameters) == (waiting, request["parameters"])
+
+
+def test_permission_ends_with_the_pairing(cloud: Cloud, anna: Person, robot: Robot, running: str) -> None:
+    del anna, robot
+    stored = cloud.run(cloud.functions.action_store.get(running))
+    assert stored is not None
+    dispatcher = cloud.functions.queues._dispatcher
+    with pytest.raises(PermissionEnded, match=r"The device was un-paired before it ended\.") as ended:
+        cloud.run(dispatcher.current_permissions(replace(stored.action, pairing="another")))
+    assert ended.value.why == UNPAIRED

@@ -6,12 +6,13 @@ import pytest
 
 from device_agent.protocol import AckStatus, Command
 from device_agent.runtime.authority.lease_gate import LeaseGate
+from function_app.domain.actions.action import RETRY_MS
 from function_app.domain.audit.hash_chain import Head
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person
-from tests.unit.function_app.services.actions.queue_requests import pass_time, queued, sent
-from tests.unit.function_app.services.control.test_restored_tables import Backup, Restore, backup, gate
+from tests.unit.function_app.services.actions.queue_requests import control_rows, pass_time, queued, reminders, sent
+from tests.unit.function_app.services.control.test_restored_tables import Backup, Restore, backup, gate, use
 
 if TYPE_CHECKING:
     from tests.fakes.tables import MemoryTables
@@ -129,3 +130,22 @@ def test_the_audit_log_names_the_restore_and_reports_missing_records(
     assert "are missing" in result.missing
     tampered = Head(old.seq, "0" * 64)
     assert "differs from the anchor" in cloud.run(reader.verify(anna.account, expected=(tampered, lost))).broken
+
+
+def test_a_reissued_action_has_a_lease_a_retry_and_events(
+    cloud: Cloud, anna: Person, robot: Robot, backup: Backup
+) -> None:
+    restore = backup()
+    use(anna, robot)
+    restore()
+    action = anna.start(robot.device, wait_ms=20_000).json()["id"]
+    rows = control_rows(cloud, robot.device)
+    lease, row = rows["now:lease"], rows[f"action:{action.rpartition('-')[2]}"]
+    assert (lease["epoch"], lease["action"], lease["pairing"]) == (row["epoch"], action, row["pairing"])
+    assert (lease["epoch"], row["reissuable"]) == (8, False)
+    taken = rows[f"event:control-taken-{lease['epoch']}"]
+    assert (taken["owner"], taken["by"]["account"], taken["event"]["data"]["from"]) == (anna.account,) * 2 + ("anna",)
+    (reminder,) = reminders(cloud)
+    assert reminder == f"{row['turn_ms'] + RETRY_MS}:{action}"
+    assert not cloud.run(cloud.functions.queues.reissue(action, lease["epoch"])), "at most once"
+    assert not cloud.run(cloud.functions.queues.reissue(f"{robot.device}-{'0' * 20}", lease["epoch"])), "unknown"
