@@ -103,6 +103,7 @@ def server_sockets(*ports: int) -> int:
     return sum(row[1].rpartition(":")[2] in local and row[3] != LISTENING and row[9] != "0" for row in rows)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(
     ("kind", "size"),
     [*((kind, SMALL) for kind in BROKERS), *(pytest.param(kind, FULL, marks=pytest.mark.long) for kind in BROKERS)],
