@@ -118,8 +118,8 @@ class StopDevices:
             raise forbidden("You may view this space, but not stop it. Ask its owner or a person on site.")
         return await asyncio.gather(*(self._one(caller, device, reason, gate) for device in devices))
 
-    async def reset(self, caller: Identity, device_id: str) -> bool:
-        """Reset the latch; return whether the device confirmed it within one second. No motion resumes.
+    async def reset(self, caller: Identity, device_id: str) -> Confirmation:
+        """Reset the latch; return whether the device confirmed it within one second, or why not. No motion resumes.
 
         The reset takes the next epoch. Commands from before the reset are fenced by their older epoch, and a late or
         repeated reset is older than a newer latch.
@@ -131,7 +131,7 @@ class StopDevices:
         result = await self._reset(caller, device)
         if result.device_epoch:  # the tables were restored from a backup
             result = await self._reset(caller, device, device_epoch=result.device_epoch)
-        return result.confirmed
+        return result
 
     async def _reset(self, caller: Identity, device: Device, *, device_epoch: int = 0) -> Confirmation:
         _, lease = await self._lease_store.change(

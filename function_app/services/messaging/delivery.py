@@ -13,7 +13,7 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from device_agent.protocol import Ack, AckStatus, topics
+from device_agent.protocol import Ack, AckStatus, Reason, topics
 from function_app.domain.devices.devices import Device
 from function_app.ports.command_bus import CommandBus
 from function_app.ports.monitoring import Tracing
@@ -28,13 +28,15 @@ CONFIRMING = frozenset({AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE})
 
 @dataclass(frozen=True, slots=True)
 class Confirmation:
-    """Whether the device accepted a command in time.
-
-    ``device_epoch``: its highest epoch, if it rejected the command because of the epoch; otherwise 0.
-    """
+    """Whether the device accepted a command in time. ``reason``: why the device rejected it."""
 
     confirmed: bool = False
-    device_epoch: int = 0
+    reason: Reason | None = None
+
+    @property
+    def device_epoch(self) -> int:
+        """The device's highest epoch, if it rejected the command because of the epoch; otherwise 0."""
+        return 0 if self.reason is None else self.reason.epoch
 
 
 class SignedCommand(NamedTuple):
@@ -118,10 +120,10 @@ class Delivery:
             try:
                 with self._tracing.span("await acks"):
                     async with asyncio.timeout(wait_ms / 1000):
-                        status, epoch = await self._first_ack(device, signed.command, acks)
+                        status, reason = await self._first_ack(device, signed.command, acks)
             except TimeoutError:
                 return Confirmation()
-            return Confirmation(status in CONFIRMING, epoch)
+            return Confirmation(status in CONFIRMING, reason)
 
     async def _first_ack(self, device: Device, command: str, acks: AsyncIterator[Ack] | None) -> Answer:
         """The first decisive ack, from the broker or the tables."""

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
-from device_agent.protocol import Ack, AckStatus
+from device_agent.protocol import Ack, AckStatus, Reason
 from function_app.domain.common.ids import oldest_first, split_command
 from function_app.domain.devices.devices import Agent, Device
 from function_app.ports.clock import Clock
@@ -43,19 +43,19 @@ class AwaitedAck:
 
     expires_ms: int
     status: AckStatus | None = None
-    epoch: int = 0
+    reason: Reason | None = None
 
 
 class Answer(NamedTuple):
-    """A decisive ack. ``epoch``: that of the device, if it rejected the command because of its epoch; otherwise 0."""
+    """A decisive ack. ``reason``: why the device rejected or ended the command."""
 
     status: AckStatus
-    epoch: int = 0
+    reason: Reason | None = None
 
     @classmethod
     def of(cls, ack: Ack) -> Self:
         """The answer in an ack."""
-        return cls(ack.status, ack.reason.epoch if ack.reason is not None else 0)
+        return cls(ack.status, ack.reason)
 
 
 class Mailbox:
@@ -147,8 +147,8 @@ class Mailbox:
                 return
             awaited = records.read(row, AwaitedAck)
             if awaited.status is None or (ack.status.terminal and not awaited.status.terminal):
-                status, epoch = Answer.of(ack)
-                data = records.to_data(replace(awaited, status=status, epoch=epoch))
+                status, reason = Answer.of(ack)
+                data = records.to_data(replace(awaited, status=status, reason=reason))
                 await self._tables.replace(records.MAILBOX, row.changed(data))
 
         await records.retry(attempt)
@@ -157,7 +157,7 @@ class Mailbox:
     async def stored_ack(self, agent: str, command: str) -> Answer | None:
         """The stored ack of a command."""
         _, awaited = await records.find(self._tables, records.MAILBOX, agent, _ack_key(command), AwaitedAck)
-        return None if awaited is None or awaited.status is None else Answer(awaited.status, awaited.epoch)
+        return None if awaited is None or awaited.status is None else Answer(awaited.status, awaited.reason)
 
     @contextlib.contextmanager
     def changes(self, agent: str) -> Iterator[asyncio.Event]:

@@ -47,7 +47,7 @@ def require_motion_and_stop(processes: CloudProcesses, device: str) -> None:
     assert processes.anna.post(f"/devices/{device}/stop").json()["outcome"] == "confirmed"
     refused = processes.anna.post(f"/devices/{device}/actions", move).json()
     assert (refused["status"], refused["reason"]["code"]) == ("failed", "stopped"), refused
-    assert processes.anna.post(f"/devices/{device}/stop/reset").json() == {"confirmed": True}
+    assert processes.anna.post(f"/devices/{device}/stop/reset").json() == {"confirmed": True, "reason": None}
 
 
 @pytest.mark.timeout(300)

@@ -14,7 +14,7 @@ MAX_DEVICES = 100
 
 
 class ReasonOut(Response, frozen=True, kw_only=True):
-    """Why an action ended."""
+    """Why an action ended, or why a command was rejected."""
 
     code: str
     message: str
@@ -104,9 +104,13 @@ class StopRequest(Request, frozen=True, kw_only=True):
 
 
 class ResetConfirmation(Response, frozen=True, kw_only=True):
-    """Whether the device has confirmed the reset within one second."""
+    """Whether the device has confirmed the reset within one second, and why it rejected it.
+
+    ``reason``: null if the device has confirmed the reset, or has not responded.
+    """
 
     confirmed: bool
+    reason: ReasonOut | None
 
 
 class StopItem(Response, frozen=True, kw_only=True):

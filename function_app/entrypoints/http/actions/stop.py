@@ -50,7 +50,10 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         Only for one device, and only by a person, who must have inspected it. API keys are rejected.
         """
         caller = await auth.account(request)
-        return json_response(schemas.ResetConfirmation(confirmed=await functions.stop.reset(caller, device)))
+        result = await functions.stop.reset(caller, device)
+        rejection = result.reason
+        reason = None if rejection is None else schemas.ReasonOut(code=rejection.code, message=rejection.message)
+        return json_response(schemas.ResetConfirmation(confirmed=result.confirmed, reason=reason))
 
     @routes.add(
         "POST /spaces/{space}/stop",

@@ -1,5 +1,5 @@
 /** The HTTP API calls of the console. The session uses an HttpOnly cookie. */
-import type { Account, Action, ActionCallOptions, ControlRequestInfo, Credentials, Device, GrantedLease, LatencyBatch, Lease, Purpose, Series, SignInMethods, Space, StorageUsage, Upload, Watcher } from "./types";
+import type { Account, Action, ActionCallOptions, ControlRequestInfo, Credentials, Device, GrantedLease, LatencyBatch, Lease, Purpose, ResetConfirmation, Series, SignInMethods, Space, StorageUsage, Upload, Watcher } from "./types";
 import { AccountApi } from "./account";
 import { HealthApi } from "./health";
 import { LatencyApi } from "./latency";
@@ -276,7 +276,7 @@ export class Api {
     return this.#http.call("POST", `/devices/${device}/stop`, { body: { reason }, keepalive: true });
   }
 
-  resetStop(device: string): Promise<{ confirmed: boolean }> {
+  resetStop(device: string): Promise<ResetConfirmation> {
     return this.#http.call("POST", `/devices/${device}/stop/reset`);
   }
 

@@ -99,6 +99,12 @@ export interface GrantedLease {
   streaming: boolean;
 }
 
+/** `reason`: why the device rejected the reset; `null` also if it has not responded. */
+export interface ResetConfirmation {
+  confirmed: boolean;
+  reason: Reason | null;
+}
+
 /** `unknown`: the device has not reported the outcome in time; its report ends the action. */
 export type ActionStatus = AckStatus | "queued" | "created" | "published" | "unknown";
 

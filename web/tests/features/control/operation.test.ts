@@ -119,12 +119,24 @@ describe("stop", () => {
     latched();
     await pass(300);
     expect(stop.state.value.kind).toBe("latched");
-    server.on(`POST ${STOP}/reset`, ok({ confirmed: true }));
+    server.on(`POST ${STOP}/reset`, ok({ confirmed: true, reason: null }));
     await stop.reset();
     deliver("tele/joints", telemetry());
     await pass(300);
     expect(stop.state.value.kind).toBe("clear");
     expect(control.streamer.value?.state.value).toBe("idle");
+  });
+
+  it("names the reason of a rejected reset", async () => {
+    latched();
+    const reason = { code: "device_stopped", message: "the device has stopped itself: protective stop" };
+    server.on(`POST ${STOP}/reset`, ok({ confirmed: false, reason }));
+    await stop.reset();
+    expect(stop.error.value).toBe("The robot rejected the reset: the device has stopped itself: protective stop.");
+    expect(stop.state.value.kind).toBe("latched");
+    server.on(`POST ${STOP}/reset`, ok({ confirmed: false, reason: null }));
+    await stop.reset();
+    expect(stop.error.value).toBe("The robot has not confirmed the reset yet.");
   });
 });
 

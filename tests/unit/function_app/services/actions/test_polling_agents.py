@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from device_agent.protocol import AckStatus
+from device_agent.protocol import AckStatus, Reason
 from function_app.domain.actions.action import ASK_MS
 from function_app.domain.devices.devices import POLL_SILENT_MS
 from tests.harness.cloud.cloud import MOVE, Cloud, Person
@@ -64,3 +64,10 @@ def test_stop_of_an_agent_that_stopped_polling_is_unreachable(
     cloud.clock.advance(silent_ms / 1000)
     answer = anna.post(f"/devices/{robot.device}/stop")
     assert (answer.status_code, answer.json()["outcome"]) == (202, outcome)
+
+
+def test_a_rejected_reset_names_the_reason_of_the_device(anna: Person, robot: PollingRobot) -> None:
+    call = anna.begin("POST", f"/devices/{robot.device}/stop/reset")
+    (item,) = robot.fetch()
+    robot.post_ack(item["id"], AckStatus.FAILED, reason=Reason(code="device_stopped", message="protective stop"))
+    assert call().json() == {"confirmed": False, "reason": {"code": "device_stopped", "message": "protective stop"}}

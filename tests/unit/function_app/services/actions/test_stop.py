@@ -43,7 +43,7 @@ def test_stop_and_reset_are_sent_and_recorded(anna: Person, robot: Robot) -> Non
     assert (command.request, command.epoch, command.caller) == (StopDevice(reason="smoke"), 0, "anna")
     assert command.id == robot.stops[0].id, "the device applies it once"
     assert robot.received(ResetStop) == []
-    assert elsewhere.post(f"/devices/{robot.device}/stop/reset").json() == {"confirmed": True}
+    assert elsewhere.post(f"/devices/{robot.device}/stop/reset").json() == {"confirmed": True, "reason": None}
     assert len(robot.received(ResetStop)) == 1
     reset, stop, _ = anna.get(f"/devices/{robot.device}/events").json()["items"]
     assert (reset["kind"], reset["data"]["caller"], reset["data"]["from"]) == ("stop-reset-ordered", "anna", "anna")
@@ -71,7 +71,7 @@ def test_the_unsigned_message_is_repeated_until_confirmed(anna: Person, robot: R
     assert outcome(anna.post(f"/devices/{robot.device}/stop")) == (202, "sent")
     assert len(robot.stops) >= 3
     assert len({stop.id for stop in robot.stops}) == 1
-    assert anna.post(f"/devices/{robot.device}/stop/reset").json() == {"confirmed": False}
+    assert anna.post(f"/devices/{robot.device}/stop/reset").json() == {"confirmed": False, "reason": None}
 
 
 def test_an_offline_robot_receives_stop(anna: Person, robot: Robot) -> None:
@@ -148,6 +148,15 @@ def test_an_unresponsive_device_delays_no_other_and_is_named(two_rooms: TwoRooms
     assert [anna.action(action)["status"] for action in waiting[1:]] == ["cancelled"] * 2
     events = anna.get(f"/devices/{second.device}/events").json()["items"]
     assert [item["kind"] for item in events if item["kind"].startswith("stop")] == ["stop-ordered"]
+
+
+def test_a_rejected_reset_names_the_reason_of_the_device(anna: Person, robot: Robot) -> None:
+    message = "the device has stopped itself: protective stop"
+    robot.silent = True
+    call = anna.begin("POST", f"/devices/{robot.device}/stop/reset")
+    (command,) = robot.received(ResetStop)
+    robot.fail(command.id, "device_stopped", message)
+    assert call().json() == {"confirmed": False, "reason": {"code": "device_stopped", "message": message}}
 
 
 def test_without_a_broker_each_device_is_reported(anna: Person, robot: Robot, broker: MemoryBroker) -> None:

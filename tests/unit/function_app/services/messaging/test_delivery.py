@@ -74,8 +74,11 @@ class AckBus:
         yield None if self.statuses is None else QueuedAcks(received)
 
 
+STALE = Reason(code="stale_epoch", message="", epoch=7)
+
+
 def ack(status: AckStatus) -> Ack:
-    reason = Reason(code="stale_epoch", message="", epoch=7) if status is AckStatus.FAILED else None
+    reason = STALE if status is AckStatus.FAILED else None
     return Ack(id=SIGNED.command, status=status, sequence=1, at_ms=1, tick_ms=1, reason=reason)
 
 
@@ -87,12 +90,12 @@ RECEIVED, STARTED, FAILED, EXPIRED = AckStatus.RECEIVED, AckStatus.STARTED, AckS
     ("transport", "on_bus", "in_tables", "answer", "ends_s"),
     [
         ("mqtt", [RECEIVED, STARTED], None, Confirmation(confirmed=True), 0.0),
-        ("mqtt", [RECEIVED, FAILED], None, Confirmation(confirmed=False, device_epoch=7), 0.0),
+        ("mqtt", [RECEIVED, FAILED], None, Confirmation(confirmed=False, reason=STALE), 0.0),
         ("mqtt", [EXPIRED, STARTED], None, Confirmation(confirmed=False), 0.0),
         ("mqtt", [RECEIVED], STARTED, Confirmation(confirmed=False), 1.0),
         ("mqtt", None, STARTED, Confirmation(confirmed=True), 0.5),
         ("xmpp", [STARTED], None, Confirmation(confirmed=True), 0.0),
-        ("xmpp", [RECEIVED], FAILED, Confirmation(confirmed=False, device_epoch=7), 0.5),
+        ("xmpp", [RECEIVED], FAILED, Confirmation(confirmed=False, reason=STALE), 0.5),
         ("xmpp", [], None, Confirmation(confirmed=False), 1.0),
         ("http", [STARTED], None, Confirmation(confirmed=False), 1.0),
         ("http", [], STARTED, Confirmation(confirmed=True), 0.5),

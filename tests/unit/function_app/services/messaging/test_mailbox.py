@@ -84,7 +84,7 @@ def test_lease_action_stop_and_reset_need_no_broker(open_cloud: OpenCloud) -> No
         final = anna.action(action["id"], wait_ms=10_000, wait_for="done")
         assert (final["status"], final["result"]) == ("done", {"reached": True})
         assert call("POST", "stop", {"reason": "look out"}).json()["outcome"] == "confirmed"
-        assert call("POST", "stop/reset").json() == {"confirmed": True}
+        assert call("POST", "stop/reset").json() == {"confirmed": True, "reason": None}
         problem(call("DELETE", f"lease?epoch={lease['epoch']}"), 409, "lease-lost")
         again = call("POST", "lease").json()["epoch"]
         assert call("DELETE", f"lease?epoch={again}").status_code == 204

@@ -103,8 +103,12 @@ def test_a_withdrawn_command_or_stop_is_deleted(put: Put, polled_mailbox: Polled
         polled_mailbox.loop.complete(polled_mailbox.withdraw(AGENT.id, "c2"))
 
 
+def stale(epoch: int) -> Reason:
+    return Reason(code="stale_epoch", message="", epoch=epoch)
+
+
 def ack(status: AckStatus, *, epoch: int = 0) -> Ack:
-    reason = Reason(code="stale_epoch", message="", epoch=epoch) if epoch else None
+    reason = stale(epoch) if epoch else None
     return Ack(id="c1", status=status, sequence=1, at_ms=1, tick_ms=1, reason=reason)
 
 
@@ -114,8 +118,8 @@ def ack(status: AckStatus, *, epoch: int = 0) -> Ack:
         ([], None),
         ([ack(AckStatus.STARTED)], Answer(AckStatus.STARTED)),
         ([ack(AckStatus.ACCEPTED), ack(AckStatus.STARTED)], Answer(AckStatus.ACCEPTED)),
-        ([ack(AckStatus.STARTED), ack(AckStatus.FAILED, epoch=7)], Answer(AckStatus.FAILED, 7)),
-        ([ack(AckStatus.FAILED, epoch=7), ack(AckStatus.DONE)], Answer(AckStatus.FAILED, 7)),
+        ([ack(AckStatus.STARTED), ack(AckStatus.FAILED, epoch=7)], Answer(AckStatus.FAILED, stale(7))),
+        ([ack(AckStatus.FAILED, epoch=7), ack(AckStatus.DONE)], Answer(AckStatus.FAILED, stale(7))),
     ],
 )
 def test_the_first_ack_is_stored_until_a_terminal_one_follows(

@@ -117,8 +117,9 @@ export class StopSwitch {
     this.#resetting.value = true;
     this.#error.value = null;
     try {
-      const { confirmed } = await this.#api.resetStop(this.#device.id);
-      if (!confirmed) this.#error.value = "The robot has not confirmed the reset yet.";
+      const { confirmed, reason } = await this.#api.resetStop(this.#device.id);
+      if (reason !== null) this.#error.value = `The robot rejected the reset: ${reason.message.replace(/\.$/, "")}.`;
+      else if (!confirmed) this.#error.value = "The robot has not confirmed the reset yet.";
       this.#pressed.value = null;
     } catch (error) {
       this.#error.value = sentence(error);
