@@ -34,6 +34,15 @@ def test_repeated_rejections_are_counted() -> None:
     assert len(recorder.drain(30.0)) == 1, "and a later one is recorded immediately again"
 
 
+def test_a_rejection_that_is_over_or_recent_does_not_hide_another() -> None:
+    recorder = EventRecorder()
+    for code, now_s in (("over", 0.0), ("recent", GAP_S), ("old", 0.0), ("old", 1.0)):
+        recorder.record_rejection(refusal(), code=code, now_s=now_s)
+    assert len(recorder.drain(GAP_S / 2)) == 3
+    (counted,) = recorder.drain(GAP_S + 0.1)
+    assert counted.data["count"] == 1
+
+
 def test_the_last_drain_returns_all_counts() -> None:
     recorder = EventRecorder()
     recorder.record_rejection(refusal(), code="too_old", now_s=10.0)
@@ -48,7 +57,8 @@ def test_memory_is_bounded_and_dropped_events_are_counted() -> None:
         recorder.record_rejection(refusal(), code=f"code{number}", now_s=0.0)
     *events, dropped = recorder.drain(0.0)
     assert len(events) == module._MAX_COUNTED
-    assert (dropped.kind, dropped.data) == (EventKind.EVENTS_DROPPED, {"count": 3})
+    assert (dropped.kind, dropped.severity, dropped.data) == (EventKind.EVENTS_DROPPED, "warning", {"count": 3})
+    assert dropped.message.startswith("3 events were not recorded individually")
     assert recorder.drain(0.1) == []
     for _ in range(module._MAX_WAITING + 7):
         recorder.record(EventRecord(EventKind.MOTION_HELD, "held"))

@@ -1,6 +1,9 @@
 """Fault reporter: one fault for each condition, with a count of its occurrences."""
 
+from unittest import mock
+
 from device_agent.protocol import Fault
+from device_agent.runtime.authority import fault_reporter
 from device_agent.runtime.authority.fault_reporter import FaultReporter
 
 STABLE_S = 30.0
@@ -29,6 +32,15 @@ def test_a_condition_that_comes_and_goes_is_one_fault_with_a_count() -> None:
     (fault,) = fixture.reporter.faults
     assert (fault.count, fault.message, fixture.raised, fixture.cleared) == (820, "gap 819", 1, 0)
     assert fault.last_ms > fault.since_ms
+
+
+def test_each_occurrence_has_its_time() -> None:
+    fixture = ReporterFixture()
+    with mock.patch.object(fault_reporter, "wall_ms", side_effect=[1000, 2000]):
+        fixture.see("driver")
+        assert fixture.reporter.faults[0].last_ms == 1000
+        fixture.see("driver")
+        assert fixture.reporter.faults[0].last_ms == 2000
 
 
 def test_a_fault_is_cleared_after_a_stable_time_and_its_recurrence_is_a_new_fault() -> None:
