@@ -12,8 +12,10 @@ import msgspec
 from device_agent.protocol.security.grants import Grant, covering
 from device_agent.protocol.security.revocation import Revoke
 
-_TIDY_AT = 1_000
-"""Number of revocations at which expired ones are removed."""
+_SWEEP_S = 60.0
+"""Interval between removals of expired revocations from memory [s]."""
+_REWRITE_AT = 1_000
+"""Number of lines at which the file is rewritten, if less than half of them are in force."""
 
 
 class RevocationsError(Exception):
@@ -32,6 +34,7 @@ class Revocations:
     """Revocations by token id, client id or principal.
 
     The file has one JSON object per line and is appended to. ``open``, and growth, rewrite it without expired entries.
+    Memory holds the revocations of the last ``keep_s`` and one sweep.
     A line truncated by a crash is ignored.
     """
 
@@ -41,7 +44,8 @@ class Revocations:
         self._keep_s = keep_s
         self._before: dict[tuple[str, str], float] = {}
         self._file: IO[str] | None = None
-        self._tidy_at = _TIDY_AT
+        self._lines = 0
+        self._swept_s = time.monotonic()
 
     def open(self) -> None:
         """Load the file, remove expired entries, and keep it open.
@@ -77,9 +81,10 @@ class Revocations:
             self._file.write(_line(entry))
             self._file.flush()
             os.fsync(self._file.fileno())
-        if len(self._before) >= self._tidy_at:
+            self._lines += 1
+        if time.monotonic() - self._swept_s >= _SWEEP_S:
             self._remove_expired()
-            self._tidy_at = max(_TIDY_AT, 2 * len(self._before))
+        if self._lines >= max(_REWRITE_AT, 2 * len(self._before)):
             with contextlib.suppress(OSError):  # the existing file is still complete
                 self._rewrite()
 
@@ -103,6 +108,7 @@ class Revocations:
 
     def _remove_expired(self) -> None:
         """Remove entries that can no longer cover a valid token."""
+        self._swept_s = time.monotonic()
         oldest = time.time() - self._keep_s
         self._before = {key: before for key, before in self._before.items() if before >= oldest}
 
@@ -118,7 +124,7 @@ class Revocations:
             temporary.replace(self._path)
             on_error.pop_all()
         self.close()
-        self._file = file
+        self._file, self._lines = file, len(self._before)
 
     def _store(self, entry: _Entry) -> None:
         key = (entry.field, entry.value)

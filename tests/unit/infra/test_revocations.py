@@ -65,13 +65,30 @@ def test_revocations_survive_a_crash_and_a_truncated_line(open_file: Opener, pat
     assert len(path.read_text().splitlines()) == 1
 
 
-def test_expired_revocations_are_removed(open_file: Opener, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_TIDY_AT", 3)
+def test_expired_revocations_are_removed_from_memory_once_per_sweep(
+    open_file: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
     revocations = open_file(keep_s=50)
     revocations.add(Revoke(client_id="c", before_s=time.time() - 100))
-    for name in ("x", "y"):
-        revocations.add(Revoke(client_id=name))
+    revocations.add(Revoke(client_id="x"))
+    assert len(revocations._before) == 2
+    monkeypatch.setattr(module, "_SWEEP_S", 0.0)
+    revocations.add(Revoke(client_id="y"))
+    assert [value for _, value in revocations._before] == ["x", "y"]
     assert not revocations.covers(GRANT, 0.0)
+
+
+def test_the_file_is_rewritten_when_half_of_it_has_expired(
+    open_file: Opener, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_REWRITE_AT", 4)
+    monkeypatch.setattr(module, "_SWEEP_S", 0.0)
+    revocations = open_file(keep_s=50)
+    for name in ("a", "b"):
+        revocations.add(Revoke(client_id=name, before_s=time.time() - 100))
+    revocations.add(Revoke(client_id="x"))
+    assert len(path.read_text().splitlines()) == 3
+    revocations.add(Revoke(client_id="y"))
     assert len(path.read_text().splitlines()) == 2
     revocations.add(Revoke(client_id="z"))
     revocations.close()
@@ -81,12 +98,13 @@ def test_expired_revocations_are_removed(open_file: Opener, path: Path, monkeypa
 
 
 def test_a_failed_rewrite_keeps_the_file(open_file: Opener, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_TIDY_AT", 3)
+    monkeypatch.setattr(module, "_REWRITE_AT", 3)
     revocations = open_file()
     blocker = path.with_name("r.new")
     blocker.mkdir()
-    for name in ("x", "y", "z", "c"):
-        revocations.add(Revoke(client_id=name))
+    for _ in range(2):
+        for name in ("x", "c"):
+            revocations.add(Revoke(client_id=name))
     revocations.close()
     assert len(path.read_text().splitlines()) == 4
     blocker.rmdir()
