@@ -166,6 +166,17 @@ def test_a_renewal_and_a_command_of_the_same_epoch_end_nothing() -> None:
     assert fixture.authority.ended
 
 
+def test_the_epoch_of_an_expired_lease_is_burned() -> None:
+    gate = LeaseGate()
+    gate.grant(epoch=3, holder="ann", lease_s=5.0, now_s=10.0)
+    assert not gate.expire(14.9)
+    assert gate.expire(15.0)
+    assert (gate.burned, gate.granted) == (3, None)
+    assert not gate.expire(16.0)
+    with refuses("lease_ended"):
+        gate.grant(epoch=3, holder="ann", lease_s=5.0, now_s=16.0)
+
+
 def test_commands_of_ended_and_older_epochs_are_rejected() -> None:
     fixture = Fixture()
     fixture.acting()
