@@ -99,8 +99,7 @@ def run_example(machine: Machine, api: Api, *arguments: str) -> str:
 def test_each_example_program_runs(
     machine: Machine, api: Api, program: str, arguments: tuple[str, ...], expected: str
 ) -> None:
-    device = api.device("ur5")
-    assert device["online"]
+    assert api.free_device()["online"]
     assert expected in run_example(machine, api, program, *arguments)
 
 
@@ -109,5 +108,5 @@ def test_example_movements_run(api: Api, name: str) -> None:
     source = (EXAMPLES / "nod.py").read_text() if name == "nod" else block(SCRIPTS, "file", "movements/greet.py")
     api.http.put(f"/robot-types/ur5/movements/{name}", json={"source": source}).raise_for_status()
     body = {"request": {"kind": "run_movement", "name": name}, "wait_ms": 30_000, "wait_for": "done"}
-    assert api.post(f"/devices/{api.device('ur5')['id']}/actions", body)["status"] == "done"
+    assert api.post(f"/devices/{api.free_device()['id']}/actions", body)["status"] == "done"
     api.http.delete(f"/robot-types/ur5/movements/{name}").raise_for_status()

@@ -71,7 +71,7 @@ def test_rostopic_moves_the_arm_with_a_lease_only(machine: Machine, system: RosS
     wait_until(lambda: "rejected: not in control of ur5" in output.read_text(), "a rejection")
     assert wrist(machine) == pytest.approx(before, abs=0.01)
     with machine.api() as api:
-        lease = api.post(f"/devices/{api.device()['id']}/lease")
+        lease = api.post(f"/devices/{api.free_device()['id']}/lease")
         system.run("rostopic", "pub", "-1", "/telescope/ur5/control", "std_msgs/Bool", "data: true")
         wait_until(lambda: "409" in output.read_text(), "a rejection: another operator has control")
         api.http.delete(f"/devices/{api.device()['id']}/lease", params={"epoch": lease["epoch"]}).raise_for_status()

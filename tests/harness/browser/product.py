@@ -133,6 +133,12 @@ class Api:
         wait_until(online, f"{name} to be online")
         return found[0]
 
+    def free_device(self, name: str = "ur5") -> dict[str, Any]:
+        """The same without a lease: the lease of a page that an earlier test closed may last for some seconds."""
+        device = self.device(name)
+        wait_until(lambda: self.get(f"/devices/{device['id']}/lease")["lease"] is None, f"{name} to be free")
+        return device
+
     @staticmethod
     def _ok(answer: httpx.Response) -> Any:
         assert answer.is_success, f"{answer.request.method} {answer.request.url}: {answer.status_code} {answer.text}"
