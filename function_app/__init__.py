@@ -9,14 +9,14 @@ from typing import Any
 
 VERSION = "0.1.0"
 _AZURE = "app"
-_LOOK_AFTER = 20_000
-"""The collector looks for cycles after so many new objects, not 700: imports make hundreds of thousands that all stay,
-and going through them was 7 % of a cold start."""
+_STARTING = 20_000
+"""Number of new objects after which garbage is collected at the start, instead of 700. Imports create hundreds of
+thousands of objects that all stay; collecting among them was 7 % of a cold start."""
 _RUNNING = (gc.get_threshold()[0], 1, 1)
-"""Thresholds of a running program. All objects made before are frozen, so a full collection is cheap. With Python's own
-(10, 10), the embedded broker kept the garbage of 5,000 connections, 3 MB."""
+"""Thresholds of a running program. All earlier objects are frozen, so a full collection visits few objects. With
+Python's own thresholds (700, 10, 10), the embedded broker kept the garbage of 5,000 connections, 3 MB."""
 
-gc.set_threshold(_LOOK_AFTER, *gc.get_threshold()[1:])
+gc.set_threshold(_STARTING, *gc.get_threshold()[1:])
 
 
 def run_for_long() -> None:
@@ -26,7 +26,7 @@ def run_for_long() -> None:
     """
     gc.collect()
     gc.freeze()
-    gc.collect()  # Python compares new objects with the number that the last full collection left
+    gc.collect()  # a full collection waits until new objects are a quarter of those that the last one left
     gc.set_threshold(*_RUNNING)
 
 

@@ -30,7 +30,7 @@ from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
-from function_app.ports.device_feed import DeviceFeed, TelemetryFeed
+from function_app.ports.feeds import DeviceFeed, TelemetryFeed
 from function_app.ports.monitoring import Metrics, NoMetrics, NoTracing, Tracing
 from function_app.ports.oidc_provider import OidcProvider
 from function_app.ports.password_hasher import PasswordHasher

@@ -5,7 +5,7 @@ from function_app.adapters.local.command_feed import MqttCommandFeed
 from function_app.adapters.mqtt.connection import Broker, MqttConnection
 from function_app.bootstrap import Functions
 from function_app.ports.broker_link import Credentials, OnMessage, OpenLink
-from function_app.ports.command_feed import CommandFeed
+from function_app.ports.feeds import CommandFeed
 from function_app.ports.xmpp_connection import XmppConnection
 from function_app.settings import SettingsError
 

@@ -15,7 +15,7 @@ from device_agent.protocol.security.revocation import Revoke
 _SWEEP_S = 60.0
 """Interval between removals of expired revocations from memory [s]."""
 _REWRITE_AT = 1_000
-"""Number of lines at which the file is rewritten, if less than half of them are in force."""
+"""Number of lines at which the file is rewritten, if at most half of them are in force."""
 
 
 class RevocationsError(Exception):
@@ -85,6 +85,7 @@ class Revocations:
         if time.monotonic() - self._swept_s >= _SWEEP_S:
             self._remove_expired()
         if self._lines >= max(_REWRITE_AT, 2 * len(self._before)):
+            self._lines = 0  # after a failed rewrite, the next one waits for as many lines again
             with contextlib.suppress(OSError):  # the existing file is still complete
                 self._rewrite()
 

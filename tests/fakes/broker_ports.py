@@ -16,7 +16,7 @@ from device_agent.protocol.topics import ANY
 from function_app.domain.common.problems import Problem
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials, check_revocation
 from function_app.ports.command_bus import BusUnavailable
-from function_app.ports.device_feed import BatchHandler, Handler
+from function_app.ports.feeds import BatchHandler, Handler
 from function_app.ports.tables import StoreError
 from tests.fakes.broker import RETRY_S, TRIES, MemoryBroker
 from tests.harness.network.brokers import Message

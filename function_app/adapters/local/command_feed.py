@@ -12,7 +12,7 @@ from device_agent.protocol.security import grants
 from device_agent.protocol.topics import ANY
 from function_app.adapters.mqtt.connection import Broker, MqttConnection
 from function_app.ports.broker_access import BrokerAccess, ServiceCredentials
-from function_app.ports.command_feed import OnMessage
+from function_app.ports.feeds import OnMessage
 
 LIFETIME_S = 24 * 3600.0
 

@@ -12,7 +12,7 @@ from device_agent.protocol import topics
 from device_agent.protocol.topics import ANY
 from function_app.adapters.mqtt.connection import Broker, MqttConnection
 from function_app.domain.common.problems import Problem
-from function_app.ports.device_feed import BatchHandler, Handler
+from function_app.ports.feeds import BatchHandler, Handler
 from function_app.ports.tables import StoreError
 
 MAX_WAITING = 10_000

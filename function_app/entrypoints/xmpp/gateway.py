@@ -22,7 +22,7 @@ from function_app.domain.devices.devices import Agent
 from function_app.entrypoints.xmpp.agent_session import AgentSession
 from function_app.entrypoints.xmpp.operators import Operators
 from function_app.ports.broker_link import OpenLink
-from function_app.ports.command_feed import CommandFeed
+from function_app.ports.feeds import CommandFeed
 from function_app.ports.tables import StoreError
 from function_app.ports.xmpp_connection import XmppConnection
 from function_app.services.storage import records

@@ -28,7 +28,7 @@ CONFIRMING = frozenset({AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE})
 
 @dataclass(frozen=True, slots=True)
 class Confirmation:
-    """Whether the device accepted a command in time. ``reason``: why the device rejected it."""
+    """Whether the device accepted a command in time. ``reason``: why it rejected the command; ``None``: it did not."""
 
     confirmed: bool = False
     reason: Reason | None = None
@@ -123,7 +123,7 @@ class Delivery:
                         status, reason = await self._first_ack(device, signed.command, acks)
             except TimeoutError:
                 return Confirmation()
-            return Confirmation(status in CONFIRMING, reason)
+            return Confirmation(confirmed=True) if status in CONFIRMING else Confirmation(reason=reason)
 
     async def _first_ack(self, device: Device, command: str, acks: AsyncIterator[Ack] | None) -> Answer:
         """The first decisive ack, from the broker or the tables."""

@@ -134,7 +134,7 @@ class Api:
         return found[0]
 
     def free_device(self, name: str = "ur5") -> dict[str, Any]:
-        """The same without a lease: the lease of a page that an earlier test closed may last for some seconds."""
+        """The device with this name, once it is online and free. A closed page may keep its lease for a while."""
         device = self.device(name)
         wait_until(lambda: self.get(f"/devices/{device['id']}/lease")["lease"] is None, f"{name} to be free")
         return device

@@ -11,7 +11,7 @@ from device_agent.protocol.topics import ANY
 from function_app.domain.common.problems import Problem
 from function_app.ports.broker_access import BrokerAccess, Credentials
 from function_app.ports.command_bus import BusUnavailable
-from function_app.ports.device_feed import BatchHandler, Handler
+from function_app.ports.feeds import BatchHandler, Handler
 from function_app.ports.tables import StoreError
 from tests.fakes.broker_ports import QueuedAcks
 from tests.simulation.network.broker import Link, Packet

@@ -71,3 +71,10 @@ def test_a_rejected_reset_names_the_reason_of_the_device(anna: Person, robot: Po
     (item,) = robot.fetch()
     robot.post_ack(item["id"], AckStatus.FAILED, reason=Reason(code="device_stopped", message="protective stop"))
     assert call().json() == {"confirmed": False, "reason": {"code": "device_stopped", "message": "protective stop"}}
+
+
+def test_a_confirmed_reset_has_no_reason(anna: Person, robot: PollingRobot) -> None:
+    call = anna.begin("POST", f"/devices/{robot.device}/stop/reset")
+    (item,) = robot.fetch()
+    robot.post_ack(item["id"], AckStatus.DONE, reason=Reason(code="odd", message="odd"))
+    assert call().json() == {"confirmed": True, "reason": None}

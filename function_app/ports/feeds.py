@@ -1,4 +1,7 @@
-"""Messages of devices, from a broker subscription of a worker. Cloud brokers call the ingest instead."""
+"""Broker subscriptions of long-running programs: messages of devices, telemetry, and commands for agents.
+
+Cloud brokers call the ingest instead.
+"""
 
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol
@@ -40,3 +43,33 @@ class TelemetryFeed(Protocol):
 
     async def run(self, handler: BatchHandler) -> None:
         """Deliver batches about every two seconds until cancelled; reconnects. Drops messages on overload."""
+
+
+OnMessage = Callable[[str, bytes], None]
+"""Called with topic and payload; must not block."""
+
+
+class CommandFeed(Protocol):
+    """Receives commands, Stop and setpoints for agents that another program represents, such as the XMPP gateway.
+
+    Best effort. Messages may be lost while disconnected. Missed commands remain in the mailbox; missed setpoints are
+    lost. ``add`` and ``drop`` are idempotent.
+
+    Example::
+
+        await feed.add(space, agent)
+        await feed.run(on_message)
+    """
+
+    @property
+    def up(self) -> bool:
+        """Whether the feed is connected and subscribed."""
+
+    async def run(self, on_message: OnMessage) -> None:
+        """Deliver messages until cancelled; reconnects without limit."""
+
+    async def add(self, space: str, agent: str, listen: Sequence[str] = ()) -> None:
+        """Subscribe to the messages of an agent, and to ``listen`` in place of its earlier topics."""
+
+    def drop(self, space: str, agent: str) -> None:
+        """Unsubscribe from the messages of an agent."""
