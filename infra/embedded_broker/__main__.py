@@ -6,6 +6,7 @@ invalid file or argument; errors print one line with advice.
 
 import argparse
 import asyncio
+import gc
 import logging
 import os
 import signal
@@ -23,6 +24,10 @@ from infra.embedded_broker.limits import Limits
 from infra.embedded_broker.log_filter import RepeatFilter
 from infra.embedded_broker.public_keys import KeyRing, KeysError
 from infra.embedded_broker.revocations import Revocations, RevocationsError
+
+FULL_COLLECTION = (1, 1)
+"""Thresholds of older generations. A message leaves no garbage, but a connection does; with Python's own (10, 10), that
+of 5,000 connections remained, 3 MB."""
 
 log = logging.getLogger("telescope.broker")
 
@@ -123,6 +128,7 @@ async def _run(
     ports = {name: bound.getsockname()[1] for name, bound in sockets.items()}
     await broker.start()
     function_app.run_for_long()
+    gc.set_threshold(gc.get_threshold()[0], *FULL_COLLECTION)
     print(f"ready tcp={ports[TCP]} websocket={ports[WEBSOCKET]}", flush=True)
     await stop.wait()
     await broker.shutdown()

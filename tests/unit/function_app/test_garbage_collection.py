@@ -1,4 +1,4 @@
-"""Garbage of a running program is collected soon, although many objects stay."""
+"""Garbage of connections is collected soon, although many objects of the embedded broker stay."""
 
 import subprocess
 import sys
@@ -10,9 +10,11 @@ import gc
 from collections import deque
 
 import function_app
+from infra.embedded_broker.__main__ import FULL_COLLECTION
 
 stays = [[] for _ in range(200_000)]
 function_app.run_for_long()
+gc.set_threshold(gc.get_threshold()[0], *FULL_COLLECTION)
 alive = deque(maxlen=2_000)  # each object outlives the first collection, as those of a connection do
 for _ in range(50_000):
     cycle = []
