@@ -165,8 +165,10 @@ class Authenticator:
                 # A token without session end limits grants to its own lifetime.
                 until_ms=int(claims.get("until", claims["exp"])) * 1000,
             )
+        except jwt.ExpiredSignatureError as error:
+            raise unauthorized("The access token has expired. Sign in again.") from error
         except (jwt.PyJWTError, KeyError) as error:
-            raise unauthorized(f"The access token is not valid: {error}. Sign in again.") from error
+            raise unauthorized("The access token is not valid. Sign in again.") from error
         await self._check_signed_out(identity)
         return _CachedToken(identity, int(claims["exp"]) * 1000, self._clock.now_ms(), str(claims.get("csrf", "")))
 

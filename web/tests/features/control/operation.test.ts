@@ -137,6 +137,10 @@ describe("stop", () => {
     server.on(`POST ${STOP}/reset`, ok({ confirmed: false, reason: null }));
     await stop.reset();
     expect(stop.error.value).toBe("The robot has not confirmed the reset yet.");
+    deliver("tele/joints", telemetry());
+    deliver("state", state(6));
+    await pass(100);
+    expect([stop.error.value, stop.state.value.kind]).toEqual([null, "clear"]);
   });
 });
 

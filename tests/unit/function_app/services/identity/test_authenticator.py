@@ -1,11 +1,11 @@
-"""Tokens that are due for a check are not cached."""
+"""Tokens that are due for a check are not cached; malformed tokens are refused."""
 
 import pytest
 
 from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Identity
 from function_app.services.identity.authenticator import API, RECHECK_MS
-from tests.harness.cloud.cloud import Cloud
+from tests.harness.cloud.cloud import Cloud, problem
 
 
 def test_tokens_due_for_a_check_are_not_cached(cloud: Cloud) -> None:
@@ -29,3 +29,9 @@ def test_tokens_due_for_a_check_are_not_cached(cloud: Cloud) -> None:
             await authenticator.person(late, API)
 
     cloud.run(check())
+
+
+@pytest.mark.parametrize("token", ["x", "x.y.z", "a" * 10_000])
+def test_a_malformed_token_is_refused_without_a_library_message(cloud: Cloud, token: str) -> None:
+    answer = cloud.request("GET", "/api/v1/accounts/me", headers={"Authorization": f"Bearer {token}"})
+    assert problem(answer, 401, "unauthorized")["detail"] == "The access token is not valid. Sign in again."

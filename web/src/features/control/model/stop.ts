@@ -42,7 +42,7 @@ export class StopSwitch {
   readonly #pressed = signal<Pressed | null>(null);
   readonly #resetting = signal(false);
   readonly #error = signal<string | null>(null);
-  readonly #disposeEffect: () => void;
+  readonly #disposeEffects: readonly (() => void)[];
   #timer: ReturnType<typeof setInterval> | undefined;
   #stateAtPress: KnownState | null = null;
 
@@ -64,7 +64,14 @@ export class StopSwitch {
     this.#device = device;
     this.#link = link;
     this.#author = author;
-    this.#disposeEffect = effect(() => {
+    let wasClear = true;
+    const clearError = effect(() => {
+      const clear = this.state.value.kind === "clear";
+      // An error of the reset is no longer true once the robot reports that it is not stopped.
+      if (clear && !wasClear) queueMicrotask(() => (this.#error.value = null));
+      wasClear = clear;
+    });
+    const confirm = effect(() => {
       const latest = device.telemetry.value;
       const pressed = this.#pressed.value;
       // The robot's own state takes precedence once it arrives.
@@ -79,6 +86,7 @@ export class StopSwitch {
         queueMicrotask(() => this.#finish(null));
       }
     });
+    this.#disposeEffects = [clearError, confirm];
   }
 
   /** Latches Stop. Can be repeated at any time. */
@@ -130,7 +138,7 @@ export class StopSwitch {
 
   dispose(): void {
     clearInterval(this.#timer);
-    this.#disposeEffect();
+    for (const dispose of this.#disposeEffects) dispose();
   }
 
   /** Without a confirmation: whether the Stop was sent, as far as this page knows. */
