@@ -16,6 +16,8 @@ SWEEP_EVERY_S = 1.0
 SWEEP_TIMEOUT_S = 120.0
 """A run that waits longer is repeated: all jobs are idempotent."""
 CHECK_EVERY_S = 0.2
+REQUIRE_AGAIN_S = 5.0
+"""Pause before the compiler is looked for again [s], which starts a process."""
 CATCH_UP_S = 10.0
 """After a start or a suspension, agents need this time to repeat what the worker has missed [s]."""
 _log = logging.getLogger(__name__)
@@ -66,6 +68,7 @@ async def check_models(functions: Functions, *, drain: bool) -> None:
 
     Raises:
         CompilerMissingError: MuJoCo is not installed, or cannot be confined.
+        StoreError: The tables are not available at the start.
     """
     await functions.model_checks.require()
     while True:
@@ -86,11 +89,15 @@ async def check_models(functions: Functions, *, drain: bool) -> None:
 
 async def _check_models(functions: Functions) -> None:
     """Check models if MuJoCo is installed and confined; another worker runs the other tasks."""
-    try:
-        await check_models(functions, drain=False)
-    except CompilerMissingError as error:
-        _log.warning("this worker does not check uploaded models: %s", error)
-        await asyncio.Event().wait()
+    while True:
+        try:
+            await check_models(functions, drain=False)
+        except CompilerMissingError as error:
+            _log.warning("this worker does not check uploaded models: %s", error)
+            await asyncio.Event().wait()
+        except StoreError as error:
+            _log.warning("model checks: %s", error)
+            await asyncio.sleep(REQUIRE_AGAIN_S)
 
 
 async def _sweep(functions: Functions) -> None:

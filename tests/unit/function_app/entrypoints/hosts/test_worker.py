@@ -66,3 +66,30 @@ def test_unavailable_tables_are_one_line_in_the_log(caplog: pytest.LogCaptureFix
         "model checks: the tables were deleted",
     }
     assert {record.exc_info for record in caplog.records} == {None}
+
+
+def test_the_worker_survives_unavailable_tables_while_it_looks_for_the_compiler() -> None:
+    loop = VirtualTimeLoop(MemoryClock())
+    calls: list[str] = []
+
+    async def require() -> None:
+        calls.append("require")
+        if calls.count("require") < 3:
+            raise StoreError("the tables were replaced")
+
+    async def run() -> bool:
+        calls.append("run")
+        return False
+
+    functions: Any = SimpleNamespace(model_checks=SimpleNamespace(require=require, run=run))
+
+    async def scenario() -> bool:
+        checks = asyncio.create_task(worker._check_models(functions))
+        await asyncio.sleep(30)
+        ended = checks.done()
+        checks.cancel()
+        return ended
+
+    assert not loop.complete(scenario()), "the worker ends with its first task"
+    loop.end()
+    assert calls[:4] == ["require"] * 3 + ["run"]
