@@ -35,7 +35,6 @@ class ActionServices(ControlServices):
     def queues(self) -> ActionQueues:
         return ActionQueues(
             tables=self.tables,
-            devices=self.devices,
             action_store=self.action_store,
             reminders=self.reminders,
             dispatcher=self.dispatcher,

@@ -24,7 +24,6 @@ from function_app.services.actions.action_store import ActionStore, StoredAction
 from function_app.services.actions.dispatcher import ActionDispatcher, MovementUnavailable, PermissionEnded
 from function_app.services.control.control_events import ControlEvents, lease_change
 from function_app.services.devices.control_rows import apply_device_epochs, read_control, read_control_rows
-from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 
@@ -44,7 +43,6 @@ class ActionQueues:
         self,
         *,
         tables: Tables,
-        devices: DeviceAccess,
         action_store: ActionStore,
         reminders: Reminders,
         dispatcher: ActionDispatcher,
@@ -52,7 +50,6 @@ class ActionQueues:
         clock: Clock,
     ) -> None:
         self._tables = tables
-        self._devices = devices
         self._action_store = action_store
         self._reminders = reminders
         self._dispatcher = dispatcher

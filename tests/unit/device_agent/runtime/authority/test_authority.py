@@ -168,7 +168,9 @@ def test_a_renewal_and_a_command_of_the_same_epoch_end_nothing() -> None:
 
 def test_the_epoch_of_an_expired_lease_is_burned() -> None:
     gate = LeaseGate()
+    assert (gate.epoch, gate.input, gate.ended_input) == (0, 0, 0)
     gate.grant(epoch=3, holder="ann", lease_s=5.0, now_s=10.0)
+    assert [gate.current(now_s) is not None for now_s in (14.9, 15.0)] == [True, False]
     assert not gate.expire(14.9)
     assert gate.expire(15.0)
     assert (gate.burned, gate.granted) == (3, None)

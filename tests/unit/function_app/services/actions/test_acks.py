@@ -9,7 +9,7 @@ import pytest
 from device_agent.protocol import Ack, AckStatus, Reason, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from function_app.domain.actions.action import AckReport, Status
-from function_app.ports.monitoring import Counter
+from function_app.ports.monitoring import Counter, Histogram
 from function_app.services.actions.acks import report
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person, paired
@@ -75,6 +75,19 @@ def test_each_ack_is_counted(cloud: Cloud, anna: Person, robot: Robot, running: 
         robot.report(running, AckStatus.DONE)
     assert (Counter.ACKS, "done") in counted
     assert anna.action(running)["status"] == "done"
+
+
+def test_the_duration_of_an_action_is_observed_once(cloud: Cloud, anna: Person, robot: Robot, running: str) -> None:
+    del anna
+    observed: list[tuple[Any, ...]] = []
+    with mock.patch.object(cloud.functions.metrics, "observe", lambda *measured: observed.append(measured)):
+        robot.report(running, AckStatus.STARTED)
+        cloud.clock.advance(3)
+        robot.report(running, AckStatus.DONE)
+        robot.report(running, AckStatus.DONE)
+    ((histogram, duration_s, status),) = [each for each in observed if each[0] is Histogram.ACTIONS]
+    assert (histogram, status) == (Histogram.ACTIONS, "done")
+    assert duration_s == pytest.approx(3, abs=0.5)
 
 
 @pytest.fixture
