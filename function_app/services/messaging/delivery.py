@@ -28,7 +28,10 @@ CONFIRMING = frozenset({AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE})
 
 @dataclass(frozen=True, slots=True)
 class Confirmation:
-    """Whether the device accepted a command in time. ``reason``: why it rejected the command; ``None``: it did not."""
+    """Whether the device accepted a command in time.
+
+    ``reason``: why it rejected the command; ``None`` if it accepted the command or did not respond in time.
+    """
 
     confirmed: bool = False
     reason: Reason | None = None
