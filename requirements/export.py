@@ -17,6 +17,7 @@ EXPORTS = {
     "requirements/local.txt": ("local",),
     "requirements/naoqi.txt": ("naoqi",),
     "requirements/node.txt": ("node",),
+    "requirements/uv.txt": ("uv",),
     "requirements/bench.txt": ("bench",),
     "requirements/docs.txt": ("docs",),
     "requirements/dev.txt": ("dev",),
