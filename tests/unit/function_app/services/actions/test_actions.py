@@ -14,6 +14,7 @@ from device_agent.protocol import (
     TakePosture,
     topics,
 )
+from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import API, MOVE, Cloud, Person, paired, problem
 
@@ -235,8 +236,21 @@ def test_the_list_is_newest_first_and_pages(anna: Person, robot: Robot) -> None:
     ids = [anna.start(robot.device, wait_ms=10_000, wait_for="done").json()["id"] for _ in range(5)]
     path = f"/devices/{robot.device}/actions"
     assert [item["id"] for item in anna.pages(path, limit=2)] == ids[::-1]
+    assert [item["id"] for item in anna.get(path, params={"limit": 2}).json()["items"]] == ids[:2:-1]
     problem(anna.get(path, params={"cursor": "§"}), 422, "cursor-invalid")
     problem(anna.get(path, params={"limit": 0}), 422, "invalid")
+
+
+def test_the_list_ends_at_the_pairing(cloud: Cloud, anna: Person, robot: Robot) -> None:
+    robot.reports = lambda _: (AckStatus.DONE,)
+    ids = [anna.start(robot.device, wait_ms=10_000, wait_for="done").json()["id"] for _ in range(4)]
+    tables = cloud.functions.tables
+    for action in ids[:3]:
+        row = cloud.run(tables.get(records.CONTROL, robot.device, f"action:{action.rpartition('-')[2]}"))
+        assert row is not None
+        cloud.run(tables.replace(records.CONTROL, row.changed({**row.data, "pairing": "earlier"})))
+    listed = anna.get(f"/devices/{robot.device}/actions", params={"limit": 2}).json()
+    assert ([item["id"] for item in listed["items"]], listed["cursor"]) == (ids[3:], None)
 
 
 def test_requests_beyond_the_devices_description_are_refused(anna: Person, robot: Robot) -> None:

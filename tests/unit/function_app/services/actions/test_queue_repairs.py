@@ -11,6 +11,7 @@ import pytest
 from device_agent.protocol import AckStatus, Mode, RunMovement, State
 from function_app.domain.actions.action import RETRY_MS, Action, Status, end
 from function_app.domain.actions.queue import UNPAIRED
+from function_app.domain.common.problems import Problem
 from function_app.ports.tables import Conflict
 from function_app.services.actions.dispatcher import PermissionEnded
 from function_app.services.devices.control_rows import read_control_rows
@@ -263,3 +264,37 @@ def test_permission_ends_with_the_pairing(cloud: Cloud, anna: Person, robot: Rob
     with pytest.raises(PermissionEnded, match=r"The device was un-paired before it ended\.") as ended:
         cloud.run(dispatcher.current_permissions(replace(stored.action, pairing="another")))
     assert ended.value.why == UNPAIRED
+
+
+def test_an_action_that_lost_its_lease_ends_with_a_recorded_rejection(anna: Person, robot: Robot, running: str) -> None:
+    epoch = anna.take_lease(robot.device).json()["epoch"]
+    waiting = queued(anna, robot.device, epoch=epoch)
+    anna.take_lease(robot.device)
+    robot.report(running, AckStatus.DONE)
+    assert reason(anna, waiting) == ("failed", "lease-lost")
+    events = anna.get(f"/devices/{robot.device}/events").json()["items"]
+    wanted = [event["data"]["wanted"] for event in events if event["kind"] == "command-rejected"]
+    assert wanted == ["start a queued action"]
+
+
+def test_the_end_of_an_earlier_lease_is_recorded_when_the_next_action_starts(
+    cloud: Cloud, anna: Person, robot: Robot, running: str
+) -> None:
+    waiting = queued(anna, robot.device)
+    epoch = anna.take_lease(robot.device, lease_ms=1_000).json()["epoch"]
+    cloud.clock.advance(2)
+    end_silently(cloud, running)
+    check(cloud, robot.device)
+    assert sent(robot) == [running, waiting]
+    assert f"event:control-expired-{epoch}" in control_rows(cloud, robot.device)
+
+
+def test_an_action_stays_queued_while_its_rows_are_busy(cloud: Cloud, anna: Person, robot: Robot, running: str) -> None:
+    waiting = queued(anna, robot.device)
+    end_silently(cloud, running)
+    busy = Problem("busy", 503, "Busy", "The rows change all the time.")
+    with mock.patch.object(cloud.functions.queues, "_start", side_effect=busy):
+        check(cloud, robot.device)
+    assert anna.action(waiting)["status"] == "queued"
+    check(cloud, robot.device)
+    assert sent(robot) == [running, waiting]

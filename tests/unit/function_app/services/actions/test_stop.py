@@ -8,7 +8,6 @@ from unittest import mock
 import pytest
 
 from device_agent.protocol import AckStatus, ResetStop, StopDevice, codec, topics
-from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.monitoring import Counter
@@ -240,33 +239,38 @@ def test_the_unsigned_message_names_the_account_and_is_repeated_after_a_failure(
     assert len(robot.received(StopDevice)) == 1
 
 
+@pytest.mark.parametrize("slow", ["queue", "message"])
 def test_the_result_is_returned_after_the_queue_was_cancelled_and_the_last_message_was_sent(
-    cloud: Cloud, anna: Person, robot: Robot
+    cloud: Cloud, anna: Person, robot: Robot, slow: str
 ) -> None:
     """A message that is sent after a reset would latch Stop again."""
-    cancelled: list[str] = []
-    last_sent: list[str] = []
+    finished: set[str] = set()
 
-    async def ending(device: Device, *_: Any) -> None:
+    async def finish(part: str) -> None:
+        if part == slow:
+            await asyncio.sleep(0.5)
+        finished.add(part)
+
+    async def send(*_: Any) -> None:
         try:
             await asyncio.sleep(60)
         finally:
-            await asyncio.sleep(0.5)
-            last_sent.append(device.id)
+            await finish("message")
 
-    async def slow(device: str, why: str) -> None:
-        await asyncio.sleep(0.5)
-        cancelled.append(f"{device} {why}")
+    async def cancel(device: str, why: str) -> None:
+        assert (device, why) == (robot.device, "stopped")
+        await finish("queue")
+
+    async def stop() -> tuple[StopResult, set[str]]:
+        caller = Identity(anna.account, anna.name, anna.session)
+        return await cloud.functions.stop.stop(caller, robot.device, ""), set(finished)
 
     with (
-        mock.patch.object(cloud.functions.queues, "cancel_all", slow),
-        mock.patch.object(cloud.functions.delivery, "stop", ending),
+        mock.patch.object(cloud.functions.queues, "cancel_all", cancel),
+        mock.patch.object(cloud.functions.delivery, "stop", send),
     ):
-        caller = Identity(anna.account, anna.name, anna.session)
-        result = cloud.run(cloud.functions.stop.stop(caller, robot.device, ""))
-    assert result == StopResult(robot.device, StopOutcome.CONFIRMED)
-    assert cancelled == [f"{robot.device} stopped"]
-    assert last_sent == [robot.device]
+        result = cloud.run(stop())
+    assert result == (StopResult(robot.device, StopOutcome.CONFIRMED), {"queue", "message"})
 
 
 def test_outcomes_are_counted(cloud: Cloud, anna: Person, robot: Robot) -> None:

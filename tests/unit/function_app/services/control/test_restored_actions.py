@@ -1,5 +1,6 @@
 """Actions that were in progress when a backup was made end truthfully after it was restored."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 import pytest
@@ -153,3 +154,23 @@ def test_a_reissued_action_has_a_lease_a_retry_and_events(
     assert row["turn_ms"] >= row["created_ms"] + 500
     assert not cloud.run(cloud.functions.queues.reissue(action, lease["epoch"])), "at most once"
     assert not cloud.run(cloud.functions.queues.reissue(f"{robot.device}-{'0' * 20}", lease["epoch"])), "unknown"
+
+
+@pytest.mark.parametrize("missing", ["permission", "lease"])
+def test_an_action_is_not_reissued_without_permission_or_lease(
+    cloud: Cloud, anna: Person, robot: Robot, backup: Backup, missing: str
+) -> None:
+    restore = backup()
+    use(anna, robot)
+    restore()
+    robot.silent = True
+    action = anna.start(robot.device, wait_ms=0).json()["id"]
+    assert robot.gate is not None
+    if missing == "permission":
+        cloud.run(cloud.functions.action_store.change(action, lambda stored: replace(stored, pairing="another")))
+    else:
+        lease = cloud.run(cloud.functions.tables.get(records.CONTROL, robot.device, "now:lease"))
+        assert lease is not None
+        cloud.run(cloud.functions.tables.delete(records.CONTROL, lease))
+    assert cloud.run(cloud.functions.queues.reissue(action, robot.gate.epoch)) is False
+    assert len(sent(robot)) == 1
