@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from device_agent.ports.sandbox import Sandbox
 from device_agent.ports.threads import SupervisedThread
-from device_agent.protocol import AckStatus, ActionState, Command, Reason, RoomTask, RunMovement, Task
+from device_agent.protocol import AckStatus, ActionState, Command, Reason, RoomTask, RunBehaviour, RunMovement, Task
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.actions.script_action import MAX_OUTPUT, ScriptAction, ScriptFailed, ScriptSandbox
@@ -174,7 +174,9 @@ class _Run:
             Refused: The device cannot be reserved.
         """
         self._activity = activity
-        self.robot.reserve(self.command.epoch, self._on_revoked)
+        request = self.command.request
+        recovery = isinstance(request, RunBehaviour) and self._context.is_recovery(request.name)
+        self.robot.reserve(self.command.epoch, self._on_revoked, recovery=recovery)
 
     def report_started(self) -> None:
         """Acknowledge the start immediately, while the action's thread starts and syncs the journal."""

@@ -6,7 +6,7 @@ import time
 from functools import partial
 from typing import Protocol
 
-from device_agent.ports.skills import Skill, SkillError
+from device_agent.ports.skills import HasBehaviours, Skill, SkillError
 from device_agent.ports.threads import SupervisedThread
 from device_agent.protocol import Express, RunBehaviour, Say, SetStiffness, TakePosture
 from device_agent.protocol.manifests import task_kinds
@@ -56,6 +56,8 @@ class SkillRunner:
                 self._mover.move_joints(target, named_poses.EXPRESSION_SPEED)
             case TakePosture(name=name, speed=speed) if not by_driver(task_kinds.POSTURES):
                 self._mover.move_joints(named_poses.posture(robot_type, name), speed)
+            case RunBehaviour(name=name) if name not in robot_type.behaviours and self._context.behaviours is not None:
+                self._run_robot_behaviour(name, self._context.behaviours)
             case RunBehaviour(name=name) if not by_driver(task_kinds.BEHAVIOURS):
                 self._run_behaviour(name)
             case Say(text=text, language=language) if not by_driver(task_kinds.SPEECH):
@@ -114,6 +116,21 @@ class SkillRunner:
                 break
             self._start_line(utterances[line.text])
         self._mover.wait_for(goal)
+
+    def _run_robot_behaviour(self, name: str, robot: HasBehaviours) -> None:
+        """Let the robot run its own behaviour. It moves itself meanwhile, unless the behaviour is a recovery."""
+        recovery, controller = self._context.is_recovery(name), self._context.controller
+        if not recovery:
+            self.wait_for_rest()
+            controller.hand_over(self._mover.reservation)
+        try:
+            robot.run_behaviour(name, _SkillContext(self._mover))
+        except SkillError as error:
+            raise self._mover.reservation.why or Refused("skill_failed", str(error)) from error
+        finally:
+            if not recovery:
+                controller.take_over()
+        self._check_running()
 
     def _start_line(self, utterance: Utterance) -> None:
         """Start to speak while the robot moves."""
