@@ -197,7 +197,7 @@ def test_a_recovery_cannot_move_joints_while_stop_is_latched(start: Start) -> No
     harness.receive_stop()
     running = harness.running(UNLOCK, epoch=1)
     robot.elbow = 1.0
-    assert harness.telemetry().mode is Mode.STOPPED
+    eventually(lambda: harness.telemetry().mode is Mode.STOPPED)
     robot.over.set()
     harness.end(running)
     assert set(robot.sent) == {0.0}
