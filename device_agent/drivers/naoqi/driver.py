@@ -243,8 +243,8 @@ class NaoqiDriver:
         """
         kind, _, _ = name.partition("-")
         if kind == SCRIPT:
-            _, script = decode(name)
-            path = self._scripts.find(script or name)
+            scripts = {encode(SCRIPT, each): each for each in self._scripts.names()}
+            path = self._scripts.find(scripts.get(name) or decode(name)[1] or name)
             return {"script": str(path), "python": self._scripts.python, "runner": str(_RUNNER)}
         connection = self._connection
         for installed in () if connection is None else connection.behaviours:

@@ -57,6 +57,7 @@ class Measurement:
         session: Session of the program that has started last.
         beat: Cycle of the program.
         beat_s: When the beat changed last, in the controller's time [s].
+        protective_s: When the present protective stop began or was first seen, in the controller's time [s].
         at_s: When the package arrived [s].
     """
 
@@ -71,6 +72,7 @@ class Measurement:
     safety_mode: int
     runtime_state: int
     beat_s: float
+    protective_s: float
     at_s: float
 
     def runs(self, session: int) -> bool:
@@ -271,6 +273,7 @@ class Connection:
             raise ValueError("a position is impossible")
         previous = self.newest
         same = previous is not None and (previous.session, previous.beat) == (session, beat)
+        stopped = previous is not None and previous.safety_mode == modes.PROTECTIVE_STOP
         return Measurement(
             time_s=time_s,
             position_rad=position,
@@ -283,5 +286,6 @@ class Connection:
             safety_mode=safety_mode,
             runtime_state=runtime_state,
             beat_s=previous.beat_s if previous is not None and same else time_s,
+            protective_s=previous.protective_s if previous is not None and stopped else time_s,
             at_s=time.monotonic(),
         )

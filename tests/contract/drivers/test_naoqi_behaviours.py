@@ -4,6 +4,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -157,6 +158,10 @@ def scripted(make: Make, scripts: Path) -> Iterator[Agent]:
 
 def head(peer: NaoPeer) -> float:
     return float(peer.state()["position"]["HeadYaw"])
+
+
+def has_turned(peer: NaoPeer, start_rad: float) -> bool:
+    return head(peer) > start_rad + 0.1
 
 
 def holds(peer: NaoPeer) -> bool:
@@ -399,9 +404,9 @@ def test_the_agent_runs_and_stops_behaviours_of_the_simulated_nao(
     until(lambda: head(peer) == pytest.approx(commanded, abs=0.05))
     device.done(MoveJoints(position_rad={"HeadYaw": 0.0}, speed=0.5), epoch=1)
     for epoch, name in ((2, LONG), (4, encode("script", "endless.py"))):
-        before = head(peer)
+        start = head(peer)
         running = device.running(RunBehaviour(name=name), epoch=epoch)
-        until(lambda start=before: head(peer) > start + 0.1)
+        until(partial(has_turned, peer, start))
         device.receive_stop()
         end = device.end(running)
         assert end.status is AckStatus.FAILED

@@ -18,7 +18,7 @@ SPEED_RAD_S = 2.0
 REST_RAD_S = 1e-6
 
 
-BEHAVIOURS = {
+BEHAVIOURS: dict[str, list[tuple[float, dict[str, float]]]] = {
     "animations/Stand/Gestures/Hey_1": [(0.6, {"RShoulderPitch": 0.3, "HeadYaw": 0.4}), (0.6, {"HeadYaw": 0.2})],
     "User/long wave.1/behavior_1": [(60.0, {"HeadYaw": 1.9})],
     "walk": [(60.0, {})],
