@@ -1,7 +1,5 @@
 """Dashboard server of the emulated controller, from the manufacturer's page; independent of the driver's code."""
 
-from collections.abc import Callable
-
 from tests.harness.robots.universal_robots.controller import (
     IDLE,
     NORMAL,
@@ -40,12 +38,11 @@ class DashboardSession:
         return "".join(self._respond(line.strip()) + "\n" for line in lines).encode()
 
     def _respond(self, command: str) -> str:
-        controller = self._controller
         self._executed.append(command)
         if not self._remote:
             return NOT_REMOTE
         name, _, argument = command.partition(" ") if command.startswith("load ") else (command, "", "")
-        commands: dict[str, Callable[[], str]] = {
+        commands = {
             "stop": self._stop,
             "unlock protective stop": self._unlock,
             "close safety popup": lambda: "closing safety popup",
