@@ -10,7 +10,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from device_agent.protocol import Express, LookAt, RunBehaviour, Say, SetStiffness, TakePosture
+from device_agent.protocol import Control, Express, LookAt, RunBehaviour, Say, SetStiffness, TakePosture
 
 
 class SkillError(Exception):
@@ -95,4 +95,25 @@ class HasBehaviours(Protocol):
 
         Raises:
             SkillError: The behaviour is unknown, not permitted or has failed, or the robot did not end it.
+        """
+
+
+@runtime_checkable
+class HasControls(Protocol):
+    """A driver of a robot with values besides joints that operators set, such as outputs or a gripper."""
+
+    @property
+    def controls(self) -> Sequence[Control]:
+        """The values and their limits; constant."""
+
+    def set_control(self, name: str, value: float, context: BehaviourContext) -> float:
+        """Set a value, which is inside its limits. Called in the thread of the action.
+
+        When the action ends, also by Stop, motion such as that of a gripper ends.
+
+        Returns:
+            The value that the robot has confirmed.
+
+        Raises:
+            SkillError: The robot does not confirm it.
         """

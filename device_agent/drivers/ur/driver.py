@@ -12,13 +12,16 @@ from device_agent.drivers.ur import modes, program
 from device_agent.drivers.ur.behaviours import UrBehaviours
 from device_agent.drivers.ur.connection import Connection, Measurement
 from device_agent.drivers.ur.dashboard import Dashboard
+from device_agent.drivers.ur.gripper import Gripper
+from device_agent.drivers.ur.outputs import IO, SETTINGS, UrOutputs
 from device_agent.drivers.ur.starter import ProgramStarter
 from device_agent.ports.driver import DriverError, DriverFault, Observation, UnreachableError
 from device_agent.ports.skills import BehaviourContext, RobotBehaviour, SkillError
-from device_agent.protocol import Twin
+from device_agent.protocol import Control, Twin
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.simulation.mjcf.robot_model import RobotModel
 
+HEALTH = "health"
 _RESTART_S = 5.0
 _POLL_S = 0.005
 ORDER = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -36,6 +39,8 @@ class Controller:
         frequency_hz: Rate of measurements [Hz].
         dashboard_port: Port of the dashboard server.
         programs: Paths of the programs on the controller that operators may run.
+        outputs: Digital outputs that operators may set, of ``outputs.OUTPUTS``.
+        gripper_port: Port of the gripper's URCap; 0: no gripper.
     """
 
     host: str
@@ -44,6 +49,8 @@ class Controller:
     frequency_hz: float
     dashboard_port: int = 29999
     programs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    gripper_port: int = 0
 
 
 class UrDriver:
@@ -74,6 +81,10 @@ class UrDriver:
         self._halted = False
         dashboard = Dashboard(controller.host, controller.dashboard_port)
         self._behaviours = UrBehaviours(dashboard, controller.programs, self._newest)
+        gripper = Gripper(controller.host, controller.gripper_port) if controller.gripper_port else None
+        self._outputs = UrOutputs(controller.outputs, gripper)
+        streams = {stream.name for stream in robot_type.streams}
+        self._measures_io = bool(controller.outputs) or IO in streams
         self._own = False  # whether a program of the controller moves the arm
         self._sends = 0
 
@@ -93,6 +104,8 @@ class UrDriver:
             session=self._session,
             frequency_hz=controller.frequency_hz,
             device=self._device,
+            io=self._measures_io,
+            banks=self._outputs.banks,
         )
         joints = [self._type.joints[index] for index in self._to_controller]
         script = program.script(
@@ -150,11 +163,13 @@ class UrDriver:
         return applied
 
     def report(self, stream: str) -> Mapping[str, float | bool]:
-        """``health``: temperatures of the joints [°C], and torques as a share of their maximum."""
+        """``health``: temperatures of the joints [°C], torques as a share of their maximum; ``io``; ``settings``."""
         connection = self._connection
         newest = None if connection is None else connection.newest
-        if stream != "health" or newest is None:
+        if newest is None or stream not in {HEALTH, IO, SETTINGS}:
             return {}
+        if stream != HEALTH:
+            return self._outputs.report(stream, newest)
         values: dict[str, float | bool] = {}
         for joint, celsius, torque in zip(
             self._type.joints, self._ordered(newest.temperature_c), self._ordered(newest.effort_nm), strict=True
@@ -162,6 +177,18 @@ class UrDriver:
             values[f"temperature_c.{joint.name}"] = round(celsius, 2)
             values[f"load.{joint.name}"] = round(abs(torque) / joint.max_effort_nm, 3)
         return values
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        """The outputs that the owner permits, and the gripper."""
+        return self._outputs.controls
+
+    def set_control(self, name: str, value: float, context: BehaviourContext) -> float:
+        """Set an output or move the gripper; returns the measured value."""
+        try:
+            return self._outputs.set(name, value, self._free(), context)
+        except DriverError as error:
+            raise SkillError(str(error)) from error
 
     @property
     def behaviours(self) -> tuple[RobotBehaviour, ...]:

@@ -10,8 +10,8 @@ from device_agent.ports.driver import Observation
 from device_agent.ports.floor_map import ObstacleMap
 from device_agent.ports.geometry import RobotGeometry
 from device_agent.ports.script_calls import GetLatest, GetState, Home, Play
-from device_agent.ports.skills import HasBehaviours, RobotBehaviour, Skills
-from device_agent.protocol import LookAt, MovePose, RunBehaviour, SetStiffness, TakePosture
+from device_agent.ports.skills import HasBehaviours, HasControls, RobotBehaviour, Skills
+from device_agent.protocol import LookAt, MovePose, RunBehaviour, SetControl, SetStiffness, TakePosture
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.manifests.task_kinds import tag, tasks_of
 from device_agent.runtime.actions.speech_output import SpeechOutput
@@ -41,6 +41,7 @@ class DeviceContext:
         observe: Newest observation, or ``None`` before the first one.
         skills: Driver with skills, if it has any.
         behaviours: Driver of a robot with behaviours of its own, if it has any.
+        controls: Driver of a robot with values that can be set, if it has any.
         own_readings: Newest reading of each stream of this device except ``joints``.
         name: Name of the device in the positions that room sensors publish.
         obstacle_map: Newest obstacle map of the room, if sensors publish one. ``go_to`` needs it.
@@ -60,6 +61,7 @@ class DeviceContext:
     speech: SpeechOutput = field(default_factory=SpeechOutput)
     wake: Callable[[], None] = lambda: None
     behaviours: HasBehaviours | None = None
+    controls: HasControls | None = None
 
     def observation(self) -> Observation:
         """The newest observation.
@@ -99,7 +101,8 @@ class DeviceContext:
 
     def tasks(self) -> tuple[str, ...]:
         """Kinds of the wire contract's tasks that this robot supports."""
-        return tuple(map(tag, self._tasks()))
+        controls = (SetControl,) if self.controls is not None and self.controls.controls else ()
+        return tuple(map(tag, (*self._tasks(), *controls)))
 
     def robot_behaviours(self) -> tuple[RobotBehaviour, ...]:
         """The robot's own behaviours, as far as they are known now and a description can list them."""

@@ -18,6 +18,7 @@ from device_agent.protocol import (
     AckStatus,
     ActionState,
     BaseLimits,
+    Control,
     Description,
     Fault,
     InterlockDescription,
@@ -101,6 +102,7 @@ class DevicePublisher:
         limits: Sequence[str],
         actions: Sequence[str],
         robot_behaviours: Callable[[], tuple[RobotBehaviour, ...]] = tuple,
+        controls: Sequence[Control] = (),
         interlocks: Sequence[InterlockDescription],
         streaming: bool,
         journal: Journal,
@@ -117,6 +119,7 @@ class DevicePublisher:
         self._limits = tuple(limits)
         self._actions = tuple(actions)
         self._robot_behaviours = robot_behaviours
+        self._controls = tuple(controls)
         self._described: tuple[RobotBehaviour, ...] | None = None
         self._interlocks = tuple(interlocks)
         self._streaming = streaming
@@ -313,7 +316,7 @@ class DevicePublisher:
             streams=robot_type.streams,
             cameras=robot_type.cameras if room is None else room.cameras,
             captures=() if room is None else room.captures,
-            controls=() if room is None else room.controls,
+            controls=self._controls if room is None else room.controls,
             watchdog_ms=round(WATCHDOG_S * 1000),
             max_loop_age_ms=round(MAX_LOOP_AGE_S * 1000),
             simulated=self._simulated,
