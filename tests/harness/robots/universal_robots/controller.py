@@ -39,6 +39,8 @@ class Controller:
         protective_s: When the present protective stop began [s].
         files: Stored programs, by path.
         loaded: Path of the loaded program.
+        digital_outputs: Digital outputs as bits: standard from 0, tool from 16; ``digital_inputs`` likewise.
+        outputs_follow: Whether outputs follow RTDE; False: a program controls them.
         each_cycle: Called after each cycle.
     """
 
@@ -56,6 +58,9 @@ class Controller:
         self.protective_s = 0.0
         self.files = {"pick.urp": PICK, "endless.urp": PICK.replace("i < 100", "i < 100000").replace("0.005", "0.001")}
         self.loaded = ""
+        self.digital_outputs = 0
+        self.digital_inputs = 0b101
+        self.outputs_follow = True
         self.each_cycle: Callable[[Controller], None] = lambda _: None
         self.started_programs = 0
         self._program: Iterator[tuple[str, Any]] | None = None

@@ -11,7 +11,7 @@ from device_agent.drivers.behaviour_names import encode
 from device_agent.ports.driver import DriverError
 from device_agent.ports.skills import SkillError
 from device_agent.protocol.manifests import robot_type
-from tests.contract.drivers.test_naoqi_robot import NAMES, until
+from tests.contract.drivers.naoqi.test_robot import NAMES, until
 from tests.harness.paths import ROBOTS
 from tests.harness.robots.naoqi.control_thread import Action, ControlThread, MakeNao, alive, head, holds, pids
 from tests.harness.robots.naoqi.peer import NaoPeer

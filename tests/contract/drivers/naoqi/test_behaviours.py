@@ -14,7 +14,7 @@ from device_agent.ports.driver import DriverError
 from device_agent.ports.skills import SkillError
 from device_agent.protocol import AckStatus, Description, MoveJoints, ResetStop, RunBehaviour, topics
 from device_agent.protocol.manifests import robot_type
-from tests.contract.drivers.test_naoqi_robot import HOME, NAMES, until
+from tests.contract.drivers.naoqi.test_robot import HOME, NAMES, until
 from tests.harness.agent.device_harness import DeviceHarness, eventually
 from tests.harness.paths import NAOQI_PYTHON, ROBOTS
 from tests.harness.robots.naoqi.control_thread import (
