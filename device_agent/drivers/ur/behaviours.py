@@ -98,7 +98,7 @@ class UrBehaviours:
         """
         recovery = _RECOVERIES[name]
         if recovery.confirmed is not None and self._newest() is None:
-            raise SkillError("the controller is not connected; check its power and the network")
+            raise SkillError("the controller is not connected; check its power, the network and remote control")
         if name == encode(RECOVERY, "unlock_protective_stop") and not self._wait_for_unlock(context):
             return
         self._dashboard.execute(recovery.command, accepts=recovery.accepts)
