@@ -1,4 +1,4 @@
-"""Port: skills of a driver other than moving joints and base. The implementer's manual.
+"""Port: skills of a driver other than moving joints and base, and the robot's own behaviours. The implementer's manual.
 
 Most skills need no driver: the manifest contains expressions, postures, behaviours and mouth shapes, and the runtime
 moves the joints. A driver with ``perform`` takes precedence for capabilities that both its ``performs`` and its robot
@@ -6,10 +6,11 @@ type name. ``perform`` runs in the thread of the action, never in the control lo
 complete.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from device_agent.protocol import Express, LookAt, RunBehaviour, Say, SetStiffness, TakePosture
+from device_agent.protocol import Control, Express, LookAt, RunBehaviour, Say, SetStiffness, TakePosture
 
 
 class SkillError(Exception):
@@ -20,8 +21,8 @@ Skill = Say | SetStiffness | LookAt | Express | RunBehaviour | TakePosture
 """The messages of the wire contract that a driver can execute itself."""
 
 
-class SkillContext(Protocol):
-    """Context of a running skill."""
+class BehaviourContext(Protocol):
+    """Context of a running behaviour of the robot."""
 
     @property
     def ended(self) -> bool:
@@ -29,6 +30,10 @@ class SkillContext(Protocol):
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until the action has ended, at most ``timeout_s`` [s]. Returns whether it has."""
+
+
+class SkillContext(BehaviourContext, Protocol):
+    """Context of a running skill."""
 
     def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
         """Move to positions [rad] and wait. The only way for a skill to move joints: the agent's limits apply.
@@ -51,4 +56,64 @@ class Skills(Protocol):
 
         Raises:
             SkillError: The skill failed.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class RobotBehaviour:
+    """A behaviour that the robot itself provides.
+
+    Attributes:
+        name: Name for ``RunBehaviour``; an ``Id``. A behaviour of the manifest with the same name takes precedence.
+        title: The robot's own name of it, for operators; a ``Label``.
+        recovery: Whether it removes a fault. A recovery never moves joints, and may also run while Stop is latched.
+    """
+
+    name: str
+    title: str
+    recovery: bool = False
+
+
+@runtime_checkable
+class HasBehaviours(Protocol):
+    """A driver of a robot with behaviours of its own, which the action ``RunBehaviour`` runs.
+
+    During a behaviour the robot moves its joints itself, and the agent's limits do not apply. Meanwhile ``send``
+    commands nothing and returns the measured positions, and a watchdog ends the behaviour if ``send`` is not called.
+    The agent adopts the positions that ``send`` returned last, and holds there. So ``run_behaviour`` returns when the
+    robot is at rest and ``send`` has returned that position.
+    """
+
+    @property
+    def behaviours(self) -> Sequence[RobotBehaviour]:
+        """The robot's behaviours, as far as they are known now. Only accesses memory; any thread may read it."""
+
+    def run_behaviour(self, name: str, context: BehaviourContext) -> None:
+        """Run a behaviour until the robot has reported its end. Called in the thread of the action.
+
+        When the action ends, also by Stop, it ends the behaviour and returns after the robot is at rest.
+
+        Raises:
+            SkillError: The behaviour is unknown, not permitted or has failed, or the robot did not end it.
+        """
+
+
+@runtime_checkable
+class HasControls(Protocol):
+    """A driver of a robot with values besides joints that operators set, such as outputs or a gripper."""
+
+    @property
+    def controls(self) -> Sequence[Control]:
+        """The values and their limits; constant."""
+
+    def set_control(self, name: str, value: float, context: BehaviourContext) -> float:
+        """Set a value, which is inside its limits. Called in the thread of the action.
+
+        When the action ends, also by Stop, motion such as that of a gripper ends.
+
+        Returns:
+            The value that the robot has confirmed.
+
+        Raises:
+            SkillError: The robot does not confirm it.
         """

@@ -87,6 +87,20 @@ class Control(Struct, frozen=True, kw_only=True):
     upper: float
 
 
+class RobotBehaviour(Struct, frozen=True, kw_only=True):
+    """A behaviour that the robot itself provides. It moves its joints without the agent's limits.
+
+    Attributes:
+        name: Name for ``run_behaviour``; also listed in ``behaviours``.
+        label: The robot's own name of it.
+        recovery: Whether it removes a fault. It moves no joints, and may be started while Stop is latched.
+    """
+
+    name: Id
+    label: Label
+    recovery: bool = False
+
+
 class Diagnostic(Struct, frozen=True, kw_only=True):
     """How the cloud evaluates measurements of a device. Limits are in the measurement's own unit.
 
@@ -141,6 +155,7 @@ class Description(Struct, frozen=True, kw_only=True):
         position_dependent_limits: Joint ranges that depend on other joints.
         actions: Kinds of actions that the device accepts. ``postures``, ``expressions`` and ``behaviours`` list the
             names that such actions may use. Empty for older agents.
+        robot_behaviours: Those of the ``behaviours`` that the robot itself provides.
         cameras: Camera streams at ``cam/{name}``.
         captures: Raw data that can be captured.
         controls: Values that can be set.
@@ -168,6 +183,7 @@ class Description(Struct, frozen=True, kw_only=True):
     postures: tuple[Label, ...] = ()
     expressions: tuple[Label, ...] = ()
     behaviours: tuple[Label, ...] = ()
+    robot_behaviours: Annotated[tuple[RobotBehaviour, ...], Meta(max_length=128)] = ()
     streams: tuple[Stream, ...] = ()
     cameras: tuple[Stream, ...] = ()
     captures: tuple[Label, ...] = ()

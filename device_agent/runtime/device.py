@@ -16,7 +16,7 @@ from device_agent.ports.driver import Driver, HasCameras, HasSpeaker, ReportsStr
 from device_agent.ports.floor_map import ObstacleMap
 from device_agent.ports.geometry import RobotGeometry
 from device_agent.ports.sandbox import Sandbox
-from device_agent.ports.skills import Skills
+from device_agent.ports.skills import HasBehaviours, HasControls, Skills
 from device_agent.ports.speech import Speech
 from device_agent.ports.threads import SupervisedThread
 from device_agent.ports.tracing import CommandTraces, NoTraces
@@ -123,6 +123,8 @@ class Device:
             observe=lambda: self._loop.observation,
             geometry=geometry,
             skills=driver if isinstance(driver, Skills) else None,
+            behaviours=driver if isinstance(driver, HasBehaviours) else None,
+            controls=driver if isinstance(driver, HasControls) else None,
             readings=readings,
             own_readings=self._stream_sampler.latest,
             room_device=room_device,
@@ -145,6 +147,8 @@ class Device:
             simulated=driver.simulated,
             limits=self._controller.limits if robot_type.joints else (),
             actions=context.tasks() if room_device is None else room_device.actions,
+            robot_behaviours=context.robot_behaviours,
+            controls=driver.controls if isinstance(driver, HasControls) else (),
             interlocks=[rule.description for rule in interlocks],
             streaming=streaming,
             journal=journal,

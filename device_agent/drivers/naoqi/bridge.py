@@ -12,6 +12,7 @@ import math
 import os
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -27,13 +28,17 @@ _PERIOD_S = 0.02
 _STATUS_S = 0.1
 _CALL_MS = 500
 _CONNECT_MS = 3000
-_END_S = 1.0
+_END_S = 1.8
 _LAG_RAD = 0.1
 """Largest distance of a joint that holds from its command [rad]."""
 _MAX_LINE = 65536
 _SENSOR = "Device/SubDeviceList/{}/{}/Value"
 _TIME = "DCM/Time"
 _FALLEN = "robotHasFallen"
+_WALK_END_S = 1.5
+"""Longest time of the step that ends a walk [s]; then it is ended in the air."""
+_BEHAVIOUR_END_S = 5.0
+"""Longest time until the robot has confirmed the end of a behaviour [s]."""
 
 
 class Robot:
@@ -47,6 +52,8 @@ class Robot:
         self.posture = self.service("ALRobotPosture")
         self.battery = self.service("ALBattery")
         self.speech = self.service("ALTextToSpeech")
+        self.manager = self.optional_service("ALBehaviorManager")
+        self.address: str = config["url"].rpartition("/")[2]
         self.joints: list[str] = config["joints"]
         self.legs = set(config["legs"])
         self.language = str(call(self.speech.getLanguage))
@@ -62,26 +69,38 @@ class Robot:
         self._move: Any = None
         self._stop: Any = None
         self._stop_is_last = False
+        self._ending: Any = None  # event of the running behaviour or script that ends it
         call(self.motion.setMoveArmsEnabled, False, False)  # the agent moves the arms, also while the robot walks
 
     def service(self, name: str) -> Any:
         """A proxy of a service."""
         return self.session.service(name, _async=True).value(_CALL_MS)
 
+    def optional_service(self, name: str) -> Any:
+        """A proxy of a service, or ``None`` if the robot does not have it."""
+        try:
+            return self.service(name)
+        except RuntimeError:
+            return None
+
+    def installed(self) -> list[str]:
+        """Names of the behaviours on the robot."""
+        return [] if self.manager is None else [str(name) for name in call(self.manager.getInstalledBehaviors)]
+
     def move_joints(self, angles: list[float | None]) -> None:
-        """Move those joints that have an angle."""
+        """Move those joints that have an angle; none while the robot moves itself."""
         targets = {joint: angle for joint, angle in zip(self.joints, angles) if angle is not None}  # noqa: B905
         with self._lock:
             if self._held:
                 return
             self._moved_s = time.monotonic()
-            if not is_running(self._angles):
+            if targets and self._ending is None and not is_running(self._angles):
                 self._set_angles(targets)
 
     def walk(self, twist: list[float]) -> None:
         """Walk with a velocity until the next command."""
         with self._lock:
-            if self._held:
+            if self._held or self._ending is not None:
                 return
             self._walked_s = time.monotonic()
             if not any(twist):
@@ -97,10 +116,12 @@ class Robot:
             if self.walks and now_s - self._walked_s > WATCHDOG_S:
                 self._stop_walk()
             if now_s - self._moved_s > WATCHDOG_S:
+                self.end_behaviour()
                 self._hold_joints()
 
     def hold(self, *, for_good: bool = False) -> None:
         """Stop at once. ``for_good``: reject all later commands."""
+        self.end_behaviour()
         with self._lock:
             self._held = self._held or for_good
             self.walks, self._moved_s = True, -math.inf
@@ -111,7 +132,7 @@ class Robot:
         """Hold, and wait until the robot has confirmed it."""
         self.hold(for_good=True)
         end_s = time.monotonic() + _END_S
-        while (self.walks or is_running(self._angles)) and time.monotonic() < end_s:
+        while (self.walks or self._ending or is_running(self._angles)) and time.monotonic() < end_s:
             time.sleep(_CHECK_S / 4)
             with self._lock:
                 if self.walks:
@@ -158,6 +179,71 @@ class Robot:
         except RuntimeError as error:
             return str(error) or "NAOqi has rejected it"
         return ""
+
+    def perform(self, task: dict[str, Any]) -> tuple[str, list[float]]:
+        """Run a behaviour or a script to its end, then hold; returns its error, and the angles that are held."""
+        with self._lock:
+            if self._held or self._ending is not None:
+                return "the robot is busy or was halted", []
+            self._ending = ending = threading.Event()
+        try:
+            error = self._run_script(task, ending) if "script" in task else self._run_behaviour(task, ending)
+        except (RuntimeError, OSError) as failure:
+            error = str(failure) or "the robot does not respond"
+        held = self.end_motion()
+        with self._lock:
+            self._ending = None
+        return error or ("" if held and not ending.is_set() else "it was ended before its own end"), held
+
+    def end_behaviour(self) -> None:
+        """Let a running behaviour or script end. Never blocks."""
+        ending = self._ending
+        if ending is not None:
+            ending.set()
+
+    def _run_behaviour(self, task: dict[str, Any], ending: Any) -> str:
+        name = task["behaviour"]
+        if self.manager is None:
+            return "the robot has no ALBehaviorManager"
+        running = self.manager.runBehavior(name, _async=True)
+        while running.isRunning() and not ending.wait(_CHECK_S):
+            pass
+        if running.isRunning():
+            return self.stop_behaviour(name)
+        return str(running.error()) if running.hasError() else ""
+
+    def stop_behaviour(self, name: str) -> str:
+        """Stop a behaviour until the robot has confirmed it; returns an error."""
+        end_s = time.monotonic() + _BEHAVIOUR_END_S
+        while call(self.manager.isBehaviorRunning, name):
+            call(self.manager.stopBehavior, name)
+            if time.monotonic() > end_s:
+                return f"the robot does not end '{name}'"
+            time.sleep(_CHECK_S)
+        return ""
+
+    def _run_script(self, task: dict[str, Any], ending: Any) -> str:
+        """Run a program of the owner; its runner kills it when this process closes the runner's input or ends."""
+        command = [sys.executable, "-I", task["runner"], task["python"], task["script"], self.address]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as runner:  # noqa: S603
+            while runner.poll() is None and not ending.wait(_CHECK_S):
+                pass
+            return runner.communicate()[0].decode().strip()
+
+    def end_motion(self) -> list[float]:
+        """End all motion of the robot's own tasks, and hold; returns the held angles, or none without an answer."""
+        try:
+            call(self.motion.stopMove)
+            call(self.motion.killTasksUsingResources, [joint for joint in self.joints if joint not in self.legs])
+            end_s = time.monotonic() + _WALK_END_S
+            while call(self.motion.moveIsActive) and time.monotonic() < end_s:
+                time.sleep(_CHECK_S)
+            call(self.motion.killAll)
+            with self._lock:
+                self._hold_joints()
+            return self.angles(sensors=False)
+        except (RuntimeError, ValueError, TypeError):
+            return []
 
     def stop_speech(self) -> None:
         """End all speech."""
@@ -214,6 +300,8 @@ class Bridge:
             self.send({"type": "failure", "message": str(error) or repr(error)})
             return
         robot.hold()
+        self._end_previous(robot, config.get("unfinished"))
+        self.send({"type": "behaviours", "names": robot.installed()})
         for target in (self._measure, self._report, self._watch):
             threading.Thread(target=target, args=(robot,), daemon=True).start()
         try:
@@ -243,9 +331,22 @@ class Bridge:
             threading.Thread(target=self._run_task, args=(robot, command), daemon=True).start()
         elif "stop_speech" in command:
             robot.stop_speech()
+        elif "end_behaviour" in command:
+            robot.end_behaviour()
+
+    def _end_previous(self, robot: Robot, unfinished: str | None) -> None:
+        """End what a previous bridge has started and could not end."""
+        if unfinished is not None:
+            if robot.manager is not None and unfinished:
+                robot.stop_behaviour(unfinished)
+            robot.end_motion()
 
     def _run_task(self, robot: Robot, task: dict[str, Any]) -> None:
-        self.send({"type": "task", "task": task["task"], "error": robot.run(task)})
+        if "behaviour" in task or "script" in task:
+            error, held = robot.perform(task)
+            self.send({"type": "task", "task": task["task"], "error": error, "held_rad": held})
+        else:
+            self.send({"type": "task", "task": task["task"], "error": robot.run(task)})
 
     def _measure(self, robot: Robot) -> None:
         self._repeat(robot, robot.measurement, _PERIOD_S)

@@ -67,10 +67,20 @@ class Status(msgspec.Struct, frozen=True, tag="status"):
 
 
 class TaskEnd(msgspec.Struct, frozen=True, tag="task"):
-    """A task has ended, with an error or with an empty text."""
+    """A task has ended, with an error or with an empty text.
+
+    ``held_rad``: after a behaviour, the angles at which the robot holds; empty if they are unknown.
+    """
 
     task: int
     error: str
+    held_rad: tuple[float, ...] = ()
+
+
+class Behaviours(msgspec.Struct, frozen=True, tag="behaviours"):
+    """Names of the behaviours that are installed on the robot. Sent once, before the first measurement."""
+
+    names: tuple[str, ...]
 
 
 class Failure(msgspec.Struct, frozen=True, tag="failure"):
@@ -85,34 +95,43 @@ class Connection:
     Args:
         settings: How to reach the robot.
         device: Id of the device at its agent.
+        unfinished: Behaviour that a previous bridge may not have ended; empty for a script, ``None`` for none.
 
     Attributes:
         status: The newest status.
+        behaviours: Names of the installed behaviours.
         velocity_rad_s: From the last two measurements.
 
     Raises:
         UnreachableError: The bridge cannot be started, or the robot sends no valid values in time.
     """
 
-    def __init__(self, settings: Settings, device: str) -> None:
+    def __init__(self, settings: Settings, device: str, *, unfinished: str | None = None) -> None:
         self._where = settings.url
         self._count = len(settings.joints)
-        self._decoder = msgspec.json.Decoder(Measurement | Status | TaskEnd | Failure)
+        self._decoder = msgspec.json.Decoder(_Message)
         self._ready = threading.Event()
         self._closed = threading.Event()
         self._failure = "the NAOqi bridge has ended"
         self._newest: Measurement | None = None
         self._numbers = itertools.count()
-        self._tasks: dict[int, str | None] = {}
+        self._tasks: dict[int, TaskEnd | None] = {}
         self._task_changed = threading.Condition()
         self.status: Status | None = None
+        self.behaviours: tuple[str, ...] = ()
         self.velocity_rad_s = (0.0,) * self._count
         self._bridge = BridgeProcess("NAOqi bridge", settings.python, _BRIDGE)
         self._thread = SupervisedThread(
             self._receive, name=f"{device}-receiver", part="receiver of the driver", device=device
         )
         self._thread.start()
-        self.send(url=settings.url, joints=settings.joints, velocity_rad_s=settings.velocity_rad_s, legs=settings.legs)
+        self.send(
+            url=settings.url,
+            joints=settings.joints,
+            velocity_rad_s=settings.velocity_rad_s,
+            legs=settings.legs,
+            unfinished=unfinished,
+        )
         if not self._ready.wait(_START_S):
             self.close()
             raise UnreachableError(f"{self._where} sends no valid new values; restart NAOqi")
@@ -160,22 +179,20 @@ class Connection:
         self.send(task=number, **task)
         return number
 
-    def wait_for(self, task: int, timeout_s: float) -> bool:
-        """Wait until a task has ended, at most ``timeout_s`` [s]; returns whether it has.
+    def wait_for(self, task: int, timeout_s: float) -> TaskEnd | None:
+        """How a task has ended, or ``None`` if it has not within ``timeout_s`` [s].
 
         Raises:
-            SkillError: NAOqi has rejected it, or the connection is lost.
+            SkillError: The connection is lost.
         """
         with self._task_changed:
             self._task_changed.wait_for(lambda: self._tasks[task] is not None or self._closed.is_set(), timeout_s)
-            error = self._tasks[task]
-            if error is not None:
+            end = self._tasks[task]
+            if end is not None:
                 del self._tasks[task]
-        if error is None and self._closed.is_set():
+        if end is None and self._closed.is_set():
             raise SkillError(f"the connection to {self._where} is lost")
-        if error:
-            raise SkillError(error)
-        return error is not None
+        return end
 
     def stop_speech(self, task: int) -> None:
         """End a task that speaks, without waiting for its end.
@@ -205,17 +222,19 @@ class Connection:
         with self._task_changed:
             self._task_changed.notify_all()
 
-    def _accept(self, message: Measurement | Status | TaskEnd | Failure) -> None:
+    def _accept(self, message: "_Message") -> None:
         match message:
             case Measurement():
                 self._accept_measurement(message)
             case Status():
                 if {len(message.stiffness), len(message.temperature_c)} == {self._count}:
                     self.status = message
-            case TaskEnd(task=task, error=error):
+            case Behaviours(names=names):
+                self.behaviours = names
+            case TaskEnd(task=task):
                 with self._task_changed:
                     if task in self._tasks:
-                        self._tasks[task] = error
+                        self._tasks[task] = message
                         self._task_changed.notify_all()
             case Failure(message=text):
                 self._failure = text
@@ -234,3 +253,6 @@ class Connection:
         self._newest = message
         if previous and self.status:
             self._ready.set()
+
+
+_Message = Measurement | Status | TaskEnd | Behaviours | Failure

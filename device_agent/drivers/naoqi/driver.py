@@ -3,13 +3,17 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 
+from device_agent.drivers.behaviour_names import decode, encode
 from device_agent.drivers.command_limits import limit_positions, limit_twist
-from device_agent.drivers.naoqi.connection import Connection, Settings, Status
+from device_agent.drivers.naoqi.connection import Connection, Settings, Status, TaskEnd
+from device_agent.drivers.naoqi.scripts import LegacyScripts
 from device_agent.ports.driver import REST, DriverError, DriverFault, Observation, Twist, UnreachableError
-from device_agent.ports.skills import Skill, SkillContext, SkillError
+from device_agent.ports.skills import BehaviourContext, RobotBehaviour, Skill, SkillContext, SkillError
 from device_agent.protocol import Say, SetStiffness, Twin
+from device_agent.protocol.fields import printable
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.simulation.mjcf.robot_model import RobotModel
 
@@ -29,12 +33,20 @@ _STILL = 1e-4
 _POLL_S = 0.1
 _DELAY_S = 0.1
 """Time until a command to walk is visible in the robot's status [s]."""
+_BEHAVIOUR_POLL_S = 0.02
+_BEHAVIOUR_END_S = 8.0
+"""Longest time until the robot has ended a behaviour and holds [s]."""
+_ADOPTED_S = 0.5
+BEHAVIOUR, SCRIPT = "naoqi", "script"
+"""Kinds of the behaviours' names."""
+_RUNNER = Path(__file__).with_name("script_runner.py")
 
 
 class NaoqiDriver:
-    """Drives joints, walk, speech and stiffness of one NAO.
+    """Drives joints, walk, speech, stiffness and the installed behaviours of one NAO.
 
     While the robot walks, NAOqi moves the legs: ``send`` returns their measured positions, and commands the others.
+    During a behaviour of the robot it does so for all joints.
 
     Args:
         robot_type: Joints with NAOqi's names, limits and frames.
@@ -42,11 +54,23 @@ class NaoqiDriver:
         url: Address of NAOqi.
         python: Interpreter of the bridge.
         device: Id of the device at its agent.
+        patterns: Which installed behaviours operators may run; ``*`` matches any text.
+        scripts: Scripts that operators may run.
     """
 
     performs = ("speech", "stiffness")
 
-    def __init__(self, robot_type: RobotType, folder: Path, *, url: str, python: str, device: str) -> None:
+    def __init__(
+        self,
+        robot_type: RobotType,
+        folder: Path,
+        *,
+        url: str,
+        python: str,
+        device: str,
+        patterns: Sequence[str] = ("*",),
+        scripts: LegacyScripts | None = None,
+    ) -> None:
         joints = robot_type.joints
         self._type = robot_type
         self._names = tuple(joint.name for joint in joints)
@@ -65,6 +89,13 @@ class NaoqiDriver:
         self._stiffness = dict.fromkeys(self._names, 1.0)
         self._walked_s = -math.inf
         self._legs_at: list[float] | None = None  # leg command while the legs return to the agent's
+        self._patterns = tuple(patterns)
+        self._scripts = scripts or LegacyScripts(None, python)
+        self._own = False  # whether the robot moves itself
+        self._held_rad: tuple[float, ...] = ()  # where it holds after that
+        self._sends = 0
+        self._unfinished: str | None = None
+        self.behaviours: tuple[RobotBehaviour, ...] = ()
 
     @property
     def simulated(self) -> bool:
@@ -74,7 +105,9 @@ class NaoqiDriver:
     def connect(self) -> None:
         """Start the bridge, which stops the robot, and wait for the first measurement."""
         self.close()
-        self._connection = Connection(self._settings, self._device)
+        self._connection = Connection(self._settings, self._device, unfinished=self._unfinished)
+        self._unfinished = None
+        self.behaviours = self._find_behaviours(self._connection.behaviours)
         self._walked_s, self._legs_at, self._halted = -math.inf, None, False
 
     def twin(self) -> Twin | None:
@@ -100,7 +133,11 @@ class NaoqiDriver:
 
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
         """Command positions within the limits of the joints; while the robot walks, not of the legs."""
+        self._sends += 1
         connection, status = self._free()
+        if self._own:
+            connection.send(angles=[None] * len(self._names))  # for the bridge's watchdog
+            return self._held_rad or connection.measurement.position_rad
         applied = list(limit_positions(self._type, position_rad))
         commands: list[float | None] = list(applied)
         if self._walks(status):
@@ -116,6 +153,8 @@ class NaoqiDriver:
     def drive(self, twist: Twist) -> Twist:
         """Walk with a velocity within the limits of the base; a walk starts only while the robot stands."""
         connection, status = self._free()
+        if self._own:
+            return REST
         applied = limit_twist(self._type, twist)
         if max(map(abs, applied)) < _STILL or not (self._walks(status) or status.posture == _STANDING):
             applied = REST
@@ -152,12 +191,30 @@ class NaoqiDriver:
                     task = connection.start_task(stiffness=value, joints=joints or self._names)
                 case _:
                     raise SkillError("NAOqi's driver only speaks and sets the stiffness")
-            while not connection.wait_for(task, _POLL_S):
+            while (end := connection.wait_for(task, _POLL_S)) is None:
                 if context.ended and isinstance(skill, Say):
                     connection.stop_speech(task)
                     return
         except DriverError as error:
             raise SkillError(str(error)) from error
+        if end.error:
+            raise SkillError(end.error)
+
+    def run_behaviour(self, name: str, context: BehaviourContext) -> None:
+        """Run an installed behaviour, or a script that the owner permits."""
+        task = self._behaviour_task(name)
+        try:
+            connection, _ = self._free()
+            self._unfinished, self._held_rad, self._own = task.get("behaviour", ""), (), True
+            end = self._wait_for_end(connection, connection.start_task(**task), context)
+            self._unfinished, self._held_rad = None, end.held_rad
+            self._wait_for_adoption()
+        except DriverError as error:
+            raise SkillError(str(error)) from error
+        finally:
+            self._own = False
+        if end.error:
+            raise SkillError(end.error)
 
     def halt(self) -> None:
         """End a walk and hold the measured position."""
@@ -171,6 +228,52 @@ class NaoqiDriver:
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()
+
+    def _find_behaviours(self, installed: Sequence[str]) -> tuple[RobotBehaviour, ...]:
+        """The permitted behaviours and scripts. A title without unprintable characters is a valid label."""
+        permitted = [name for name in installed if any(fnmatchcase(name, pattern) for pattern in self._patterns)]
+        named = [(BEHAVIOUR, name) for name in sorted(permitted)] + [(SCRIPT, name) for name in self._scripts.names()]
+        return tuple(RobotBehaviour(encode(kind, name), printable(name)[:200]) for kind, name in named)
+
+    def _behaviour_task(self, name: str) -> dict[str, str]:
+        """The bridge's task for a behaviour of this name.
+
+        Raises:
+            SkillError: It is unknown or not permitted.
+        """
+        kind, _, _ = name.partition("-")
+        if kind == SCRIPT:
+            scripts = {encode(SCRIPT, each): each for each in self._scripts.names()}
+            path = self._scripts.find(scripts.get(name) or decode(name)[1] or name)
+            return {"script": str(path), "python": self._scripts.python, "runner": str(_RUNNER)}
+        connection = self._connection
+        for installed in () if connection is None else connection.behaviours:
+            if encode(BEHAVIOUR, installed) == name and any(each.name == name for each in self.behaviours):
+                return {"behaviour": installed}
+        known = ", ".join(each.title for each in self.behaviours) or "none"
+        raise SkillError(f"no behaviour '{name}'; the robot has: {known}")
+
+    def _wait_for_end(self, connection: Connection, task: int, context: BehaviourContext) -> TaskEnd:
+        """Wait until the robot has ended a behaviour and holds; end it with its action.
+
+        Raises:
+            DriverError: The robot does not end it; the device is halted and connects again.
+        """
+        deadline_s = math.inf
+        while (end := connection.wait_for(task, _BEHAVIOUR_POLL_S)) is None:
+            if deadline_s == math.inf and (context.ended or self._halted):
+                connection.send(end_behaviour=True)
+                deadline_s = time.monotonic() + _BEHAVIOUR_END_S
+            if time.monotonic() > deadline_s:
+                self.halt()
+                raise DriverError("the robot does not end its behaviour; press its chest button")
+        return end
+
+    def _wait_for_adoption(self) -> None:
+        """Wait until the agent has received the held position: until the second ``send`` from now has begun."""
+        end_s, sends = time.monotonic() + _ADOPTED_S, self._sends
+        while self._sends < sends + 2 and time.monotonic() < end_s:
+            time.sleep(_BEHAVIOUR_POLL_S / 4)
 
     def _connected(self) -> Connection:
         if self._connection is None:

@@ -6,8 +6,9 @@ import select
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from device_agent.drivers.ur import modes, program, rtde
 from device_agent.ports.driver import DriverError, UnreachableError
@@ -26,6 +27,14 @@ _OUTPUTS = (
     ("safety_mode", "INT32"),
     ("runtime_state", "UINT32"),
 )
+_IO = (
+    ("actual_digital_input_bits", "UINT64"),
+    ("actual_digital_output_bits", "UINT64"),
+    ("tool_analog_input0", "DOUBLE"),
+    ("tool_analog_input1", "DOUBLE"),
+    ("tool_output_voltage", "INT32"),
+)
+"""Measured only if the configuration or the robot type needs them."""
 _SETPOINT = (
     (f"input_int_register_{program.SESSION}", "INT32"),
     (f"input_int_register_{program.COUNTER}", "INT32"),
@@ -57,7 +66,12 @@ class Measurement:
         session: Session of the program that has started last.
         beat: Cycle of the program.
         beat_s: When the beat changed last, in the controller's time [s].
+        protective_s: When the present protective stop began or was first seen, in the controller's time [s].
         at_s: When the package arrived [s].
+        inputs: Digital inputs as bits: standard from 0, configurable from 8, tool from 16.
+        outputs: Digital outputs, as ``inputs``.
+        tool_analog: Analog inputs of the tool [V, or A as configured].
+        tool_voltage_v: Voltage of the tool's supply [V].
     """
 
     time_s: float
@@ -71,7 +85,12 @@ class Measurement:
     safety_mode: int
     runtime_state: int
     beat_s: float
+    protective_s: float
     at_s: float
+    inputs: int = 0
+    outputs: int = 0
+    tool_analog: tuple[float, float] = (0.0, 0.0)
+    tool_voltage_v: int = 0
 
     def runs(self, session: int) -> bool:
         """Whether the program of this session runs."""
@@ -87,15 +106,28 @@ class Connection:
         session: Number of the session.
         frequency_hz: Rate of measurements [Hz].
         device: Id of the device at its agent.
+        io: Measure inputs and outputs.
+        banks: Kinds of outputs that are set: ``standard``, ``tool``.
 
     Raises:
         UnreachableError: No connection, no valid measurement in time, or another client writes the same registers.
         DriverError: The controller's software is too old.
     """
 
-    def __init__(self, address: tuple[str, int], *, session: int, frequency_hz: float, device: str) -> None:
+    def __init__(
+        self,
+        address: tuple[str, int],
+        *,
+        session: int,
+        frequency_hz: float,
+        device: str,
+        io: bool = False,
+        banks: Collection[str] = (),
+    ) -> None:
         self._where = f"{address[0]}:{address[1]}"
         self._session = session
+        self._variables = (*_OUTPUTS, *(_IO if io else ()))
+        self._banks = banks
         self._counter = session  # random, as a first setpoint with the number of an old one would be ignored
         self._closed = threading.Event()
         self._ready = threading.Event()
@@ -151,6 +183,14 @@ class Connection:
         """
         self._send(self._cancelled.pack([self._counter]))
 
+    def set_output(self, bank: str, mask: int, values: int) -> None:
+        """Set the digital outputs of ``mask`` to the bits of ``values``; ``bank`` is one of the constructor's.
+
+        Raises:
+            UnreachableError: As for ``command``.
+        """
+        self._send(self._output_recipes[bank].pack([mask, values]))
+
     def end(self) -> None:
         """End the program of this session: it brakes. Neither blocks nor waits for a lock.
 
@@ -170,10 +210,14 @@ class Connection:
         self._set_up_until_s = time.monotonic() + _TIMEOUT_S
         try:
             setup.check_version()
-            self._outputs = setup.outputs(_OUTPUTS, frequency_hz)
+            self._outputs = setup.outputs(self._variables, frequency_hz)
             self._setpoint = setup.inputs(_SETPOINT)
             self._end = setup.inputs(_END)
             self._cancelled = setup.inputs(_CANCELLED)
+            self._output_recipes = {
+                bank: setup.inputs([(f"{bank}_digital_output_mask", "UINT8"), (f"{bank}_digital_output", "UINT8")])
+                for bank in sorted(self._banks)
+            }
             setup.start()
         except OSError as error:
             raise UnreachableError(f"{self._where} does not respond: {error}; is it an RTDE port?") from error
@@ -261,7 +305,10 @@ class Connection:
         if not all(map(math.isfinite, values)):
             raise ValueError("a value is not finite")
         time_s, *vectors = values[: 1 + 4 * JOINTS]
-        session, beat, robot_mode, safety_mode, runtime_state = map(int, values[1 + 4 * JOINTS :])
+        session, beat, robot_mode, safety_mode, runtime_state, *io = values[1 + 4 * JOINTS :]
+        session, beat, robot_mode, safety_mode, runtime_state = map(
+            int, (session, beat, robot_mode, safety_mode, runtime_state)
+        )
         position, velocity, effort, temperature = (
             tuple(vectors[first : first + JOINTS]) for first in range(0, 4 * JOINTS, JOINTS)
         )
@@ -271,6 +318,7 @@ class Connection:
             raise ValueError("a position is impossible")
         previous = self.newest
         same = previous is not None and (previous.session, previous.beat) == (session, beat)
+        stopped = previous is not None and previous.safety_mode == modes.PROTECTIVE_STOP
         return Measurement(
             time_s=time_s,
             position_rad=position,
@@ -283,5 +331,15 @@ class Connection:
             safety_mode=safety_mode,
             runtime_state=runtime_state,
             beat_s=previous.beat_s if previous is not None and same else time_s,
+            protective_s=previous.protective_s if previous is not None and stopped else time_s,
             at_s=time.monotonic(),
+            **_io(io),
         )
+
+
+def _io(values: Sequence[Any]) -> dict[str, Any]:
+    """Fields of a measurement from the values of ``_IO``; none if they are not measured."""
+    if not values:
+        return {}
+    inputs, outputs, first, second, voltage = values
+    return {"inputs": inputs, "outputs": outputs, "tool_analog": (first, second), "tool_voltage_v": voltage}

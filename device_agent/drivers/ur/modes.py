@@ -6,12 +6,14 @@ NORMAL, REDUCED = 1, 2
 PROTECTIVE_STOP = 3
 RUNNING = 7
 """Robot mode: the arm is powered and its brakes are released."""
-PLAYING, PAUSED = 2, 4
-"""Runtime states: a program runs, a program is paused."""
+POWERED = (5, RUNNING)
+"""Robot modes after the arm was switched on, with closed and with released brakes."""
+STOPPED, PLAYING, PAUSED = 1, 2, 4
+"""Runtime states: no program runs, a program runs, a program is paused."""
 
 _AT_ROBOT = "remove the cause and release it at the robot"
 _SAFETY = {
-    PROTECTIVE_STOP: ("protective-stop", "protective stop", _AT_ROBOT),
+    PROTECTIVE_STOP: ("protective-stop", "protective stop", "remove the cause, then unlock it"),
     4: ("recovery-mode", "recovery mode", "move the joints back into their limits at the robot"),
     5: ("safeguard-stop", "safeguard stop", "close the safeguard and reset it"),
     6: ("emergency-stop", "emergency stop of the system", _AT_ROBOT),
@@ -43,5 +45,5 @@ def fault(safety_mode: int, robot_mode: int) -> DriverFault | None:
         return DriverFault(code, f"{name}; {advice}")
     if robot_mode != RUNNING:
         name = _ROBOT.get(robot_mode, f"unknown robot mode {robot_mode}")
-        return DriverFault("not-running", f"{name}; start the arm at the robot")
+        return DriverFault("not-running", f"{name}; start the arm")
     return None

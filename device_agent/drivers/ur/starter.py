@@ -39,6 +39,7 @@ class ProgramStarter:
         self._stopping = threading.Event()
         self._settled = threading.Event()
         self._needed = True
+        self._suspended = False
         self._error = ""
         self._thread = SupervisedThread(
             self._run, name=f"{device}-program", part="program starter of the driver", device=device
@@ -53,6 +54,15 @@ class ProgramStarter:
         """
         if not self._settled.wait(2 * _TIMEOUT_S):
             raise UnreachableError(self._error or f"{self._where} does not start the program")
+
+    def suspend(self) -> None:
+        """Do not start the program until ``resume``: another program moves the robot."""
+        self._suspended = True
+
+    def resume(self) -> None:
+        """Start the program again."""
+        self._needed = True
+        self._suspended = False
 
     def close(self) -> None:
         """End the thread. May be called repeatedly."""
@@ -73,7 +83,7 @@ class ProgramStarter:
             if newest is not None and (stopped or newest.runtime_state == modes.PAUSED):
                 with contextlib.suppress(UnreachableError):
                     self._connection.cancel()
-            if self._needed and not stopped:
+            if self._needed and not stopped and not self._suspended:
                 self._start()
 
     def _start(self) -> None:

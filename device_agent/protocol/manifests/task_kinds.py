@@ -26,7 +26,7 @@ POSTURES, CARTESIAN = "postures", "cartesian"
 
 
 def tasks_of(
-    robot_type: RobotType, *, performed: Collection[str], has_model: bool, has_map: bool
+    robot_type: RobotType, *, performed: Collection[str], has_model: bool, has_map: bool, has_behaviours: bool = False
 ) -> tuple[type[RobotTask], ...]:
     """Types of the actions that a robot supports.
 
@@ -35,6 +35,7 @@ def tasks_of(
         performed: Capabilities that its driver executes itself.
         has_model: Whether the shape of the robot is known.
         has_map: Whether sensors of the room publish an obstacle map.
+        has_behaviours: Whether the robot itself may provide behaviours.
     """
     named = set(robot_type.capabilities)
     by_driver = named.intersection(performed)
@@ -44,7 +45,7 @@ def tasks_of(
         Say: SPEECH in named,
         Express: EXPRESSIONS in by_driver or bool(robot_type.expressions),
         TakePosture: POSTURES in by_driver or bool(robot_type.postures),
-        RunBehaviour: BEHAVIOURS in by_driver or bool(robot_type.behaviours),
+        RunBehaviour: has_behaviours or BEHAVIOURS in by_driver or bool(robot_type.behaviours),
         SetStiffness: STIFFNESS in by_driver,
         LookAt: GAZE in by_driver or (robot_type.gaze is not None and has_model),
         Drive: robot_type.base is not None,

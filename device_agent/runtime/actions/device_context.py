@@ -10,8 +10,8 @@ from device_agent.ports.driver import Observation
 from device_agent.ports.floor_map import ObstacleMap
 from device_agent.ports.geometry import RobotGeometry
 from device_agent.ports.script_calls import GetLatest, GetState, Home, Play
-from device_agent.ports.skills import Skills
-from device_agent.protocol import LookAt, MovePose, RunBehaviour, SetStiffness, TakePosture
+from device_agent.ports.skills import HasBehaviours, HasControls, RobotBehaviour, Skills
+from device_agent.protocol import LookAt, MovePose, RunBehaviour, SetControl, SetStiffness, TakePosture
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.manifests.task_kinds import tag, tasks_of
 from device_agent.runtime.actions.speech_output import SpeechOutput
@@ -29,6 +29,9 @@ SCRIPT_NAMES: Mapping[StructMeta, str] = {
 }
 """Methods of the script API whose name differs from the kind of their message."""
 
+MAX_BEHAVIOURS = 128
+"""Maximum number of behaviours in a description."""
+
 
 @dataclass(frozen=True, slots=True)
 class DeviceContext:
@@ -37,6 +40,8 @@ class DeviceContext:
     Attributes:
         observe: Newest observation, or ``None`` before the first one.
         skills: Driver with skills, if it has any.
+        behaviours: Driver of a robot with behaviours of its own, if it has any.
+        controls: Driver of a robot with values that can be set, if it has any.
         own_readings: Newest reading of each stream of this device except ``joints``.
         name: Name of the device in the positions that room sensors publish.
         obstacle_map: Newest obstacle map of the room, if sensors publish one. ``go_to`` needs it.
@@ -55,6 +60,8 @@ class DeviceContext:
     obstacle_map: Callable[[], ObstacleMap | None] | None = None
     speech: SpeechOutput = field(default_factory=SpeechOutput)
     wake: Callable[[], None] = lambda: None
+    behaviours: HasBehaviours | None = None
+    controls: HasControls | None = None
 
     def observation(self) -> Observation:
         """The newest observation.
@@ -85,6 +92,7 @@ class DeviceContext:
             performed=() if self.skills is None else self.skills.performs,
             has_model=self.geometry is not None,
             has_map=self.obstacle_map is not None,
+            has_behaviours=self.behaviours is not None,
         )
 
     def script_calls(self) -> tuple[str, ...]:
@@ -93,7 +101,18 @@ class DeviceContext:
 
     def tasks(self) -> tuple[str, ...]:
         """Kinds of the wire contract's tasks that this robot supports."""
-        return tuple(map(tag, self._tasks()))
+        controls = (SetControl,) if self.controls is not None and self.controls.controls else ()
+        return tuple(map(tag, (*self._tasks(), *controls)))
+
+    def robot_behaviours(self) -> tuple[RobotBehaviour, ...]:
+        """The robot's own behaviours, as far as they are known now and a description can list them."""
+        named = self.robot_type.behaviours
+        own = () if self.behaviours is None else self.behaviours.behaviours
+        return tuple(each for each in own if each.name not in named)[: max(0, MAX_BEHAVIOURS - len(named))]
+
+    def is_recovery(self, name: str) -> bool:
+        """Whether this is a behaviour that may run while Stop is latched."""
+        return any(each.recovery and each.name == name for each in self.robot_behaviours())
 
     def performs(self, capability: str) -> bool:
         """Whether the driver executes this skill itself; otherwise the manifest describes it."""

@@ -9,7 +9,17 @@ from typing import Any, Protocol
 
 from device_agent.ports.sandbox import Sandbox
 from device_agent.ports.threads import SupervisedThread
-from device_agent.protocol import AckStatus, ActionState, Command, Reason, RoomTask, RunMovement, Task
+from device_agent.protocol import (
+    AckStatus,
+    ActionState,
+    Command,
+    Reason,
+    RoomTask,
+    RunBehaviour,
+    RunMovement,
+    SetControl,
+    Task,
+)
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.actions.script_action import MAX_OUTPUT, ScriptAction, ScriptFailed, ScriptSandbox
@@ -60,6 +70,9 @@ class ActionExecutor:
             if isinstance(request, RunMovement):
                 run.reserve(_TimedScript(request, run, self._check_script(request)))
                 self._policy.record_version(request)
+            elif isinstance(request, SetControl) and self._context.controls is not None:
+                set_control = partial(run.robot.skill_runner.set_control, request, self._context.controls)
+                run.reserve(room_actions.OneShotAction(set_control))
             elif isinstance(request, RoomTask):
                 run.reserve(room_actions.create(request, self._context.room_device, run.add_output))
             else:
@@ -174,7 +187,9 @@ class _Run:
             Refused: The device cannot be reserved.
         """
         self._activity = activity
-        self.robot.reserve(self.command.epoch, self._on_revoked)
+        request = self.command.request
+        recovery = isinstance(request, RunBehaviour) and self._context.is_recovery(request.name)
+        self.robot.reserve(self.command.epoch, self._on_revoked, recovery=recovery)
 
     def report_started(self) -> None:
         """Acknowledge the start immediately, while the action's thread starts and syncs the journal."""

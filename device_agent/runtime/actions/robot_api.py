@@ -44,13 +44,13 @@ class RobotApi:
         self.limited: tuple[str, ...] = ()
         self.skill_runner = SkillRunner(context, self)
 
-    def reserve(self, epoch: int, on_revoked: Callable[[Refused], None]) -> None:
-        """Reserve the device. ``on_revoked`` is called with the controller locked.
+    def reserve(self, epoch: int, on_revoked: Callable[[Refused], None], *, recovery: bool = False) -> None:
+        """Reserve the device; see ``Controller.reserve``. ``on_revoked`` is called with the controller locked.
 
         Raises:
             Refused: The device cannot be reserved.
         """
-        self.reservation = self._context.controller.reserve(epoch=epoch, on_revoked=on_revoked)
+        self.reservation = self._context.controller.reserve(epoch=epoch, on_revoked=on_revoked, recovery=recovery)
 
     def end(self) -> None:
         """End running skills. Never blocks."""

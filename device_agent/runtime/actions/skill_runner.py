@@ -4,11 +4,11 @@ import contextlib
 import threading
 import time
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
-from device_agent.ports.skills import Skill, SkillError
+from device_agent.ports.skills import HasBehaviours, HasControls, Skill, SkillError
 from device_agent.ports.threads import SupervisedThread
-from device_agent.protocol import Express, RunBehaviour, Say, SetStiffness, TakePosture
+from device_agent.protocol import Express, RunBehaviour, Say, SetControl, SetStiffness, TakePosture
 from device_agent.protocol.manifests import task_kinds
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.speech_output import Utterance
@@ -17,6 +17,7 @@ from device_agent.runtime.control.goals import MotionGoal
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import named_poses
 from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, SpokenLine
+from device_agent.runtime.room.controls import check_value
 
 _REST_TIMEOUT_S = 3.0
 _SETTLE_PERIODS = 4
@@ -56,6 +57,8 @@ class SkillRunner:
                 self._mover.move_joints(target, named_poses.EXPRESSION_SPEED)
             case TakePosture(name=name, speed=speed) if not by_driver(task_kinds.POSTURES):
                 self._mover.move_joints(named_poses.posture(robot_type, name), speed)
+            case RunBehaviour(name=name) if name not in robot_type.behaviours and self._context.behaviours is not None:
+                self._run_robot_behaviour(name, self._context.behaviours)
             case RunBehaviour(name=name) if not by_driver(task_kinds.BEHAVIOURS):
                 self._run_behaviour(name)
             case Say(text=text, language=language) if not by_driver(task_kinds.SPEECH):
@@ -79,6 +82,20 @@ class SkillRunner:
             except SkillError as error:
                 raise self._mover.reservation.why or Refused("skill_failed", str(error)) from error
         self._check_running()
+
+    def set_control(self, request: SetControl, robot: HasControls) -> dict[str, Any]:
+        """Set a value of the robot; returns the ``applied`` one for the result.
+
+        Raises:
+            Refused: Unknown, out of range, not confirmed by the robot, or the action has ended.
+        """
+        check_value(robot.controls, request.control, request.value)
+        try:
+            applied = robot.set_control(request.control, request.value, _SkillContext(self._mover))
+        except SkillError as error:
+            raise self._mover.reservation.why or Refused("skill_failed", str(error)) from error
+        self._check_running()
+        return {"applied": {request.control: applied}}
 
     # ------------------------------------------------------------ speech and behaviours
 
@@ -114,6 +131,21 @@ class SkillRunner:
                 break
             self._start_line(utterances[line.text])
         self._mover.wait_for(goal)
+
+    def _run_robot_behaviour(self, name: str, robot: HasBehaviours) -> None:
+        """Let the robot run its own behaviour. It moves itself meanwhile, unless the behaviour is a recovery."""
+        recovery, controller = self._context.is_recovery(name), self._context.controller
+        if not recovery:
+            self.wait_for_rest()
+            controller.hand_over(self._mover.reservation)
+        try:
+            robot.run_behaviour(name, _SkillContext(self._mover))
+        except SkillError as error:
+            raise self._mover.reservation.why or Refused("skill_failed", str(error)) from error
+        finally:
+            if not recovery:
+                controller.take_over()
+        self._check_running()
 
     def _start_line(self, utterance: Utterance) -> None:
         """Start to speak while the robot moves."""

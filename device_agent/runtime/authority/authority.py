@@ -135,10 +135,21 @@ class Authority:
             raise Refused("device_stopped", f"the device has stopped itself: {self.fault}")
         self.latch = None
 
-    def set_fault(self, message: str, *, device_stopped: bool = False) -> None:
-        """Record that the driver failed, or that the device has stopped itself, and hold."""
-        self.fault, self.device_stopped = message, device_stopped
+    def set_fault(self, message: str) -> None:
+        """Record that the driver failed, and hold."""
+        self.fault, self.device_stopped = message, False
         self.end(Refused("fault", message))
+
+    def follow_device_stop(self, latch: StopLatch) -> None:
+        """Record that the device has stopped itself, hold, and latch Stop.
+
+        Another reason of the same stop ends nothing: a recovery that changes the reason continues.
+        """
+        stopped, self.device_stopped, self.fault = self.device_stopped, True, latch.reason
+        if not stopped:
+            self.end(Refused("fault", latch.reason))
+        if self.latch is None:
+            self.stop(latch)
 
     def clear_fault(self) -> bool:
         """Record that the driver works again. Returns False if it had not failed."""

@@ -181,6 +181,7 @@ class CommandProcessor:
         if self._connected.is_set():
             self._connected.clear()
             self._publisher.publish_description(self._twin)
+        self._publisher.update_description()
         snapshot = self._snapshot()
         self._publisher.publish_state(snapshot, urgent=self._fault_raised)
 

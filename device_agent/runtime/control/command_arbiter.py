@@ -89,7 +89,12 @@ class CommandArbiter:
         )
 
     def record_applied(self, position_rad: Sequence[float]) -> None:
-        """Compare the positions that the driver applied, shape (n,) [rad], with the command."""
+        """Compare the positions that the driver applied, shape (n,) [rad], with the command.
+
+        While the robot moves itself, they are the command instead.
+        """
+        if self._state.handed_over:
+            self._state.goals.start_at(position_rad)
         self._driver_limits = tuple(
             f"{joint.name}: driver"
             for joint, commanded, applied in zip(
@@ -117,15 +122,7 @@ class CommandArbiter:
     def _select_mode(self, now_s: float) -> Mode:
         authority, goals, stream = self._state.authority, self._state.goals, self._state.stream
         allowed = authority.restrictions.speed
-        prevented = (
-            Mode.FAULT
-            if authority.fault is not None
-            else Mode.STOPPED
-            if authority.latch is not None
-            else Mode.HOLDING
-            if allowed <= 0
-            else None
-        )
+        prevented = self._prevented(allowed)
         if prevented is not None:
             goals.brake()
             return prevented
@@ -143,6 +140,17 @@ class CommandArbiter:
         goals.brake()
         holds = self._state.mode is Mode.HOLDING and (goals.moving or authority.ended)
         return Mode.HOLDING if holds else Mode.IDLE
+
+    def _prevented(self, allowed: float) -> Mode | None:
+        """The mode in which the agent moves nothing, if it is in such a mode."""
+        authority = self._state.authority
+        if authority.fault is not None:
+            return Mode.FAULT
+        if self._state.handed_over:  # not stopped before the robot has ended its motion
+            return Mode.HOLDING if authority.reservation is None else Mode.ACTION
+        if authority.latch is not None:
+            return Mode.STOPPED
+        return Mode.HOLDING if allowed <= 0 else None
 
     def _limited(self) -> tuple[str, ...]:
         """Limits that change the motion, for telemetry."""

@@ -1,7 +1,7 @@
 """State of one device's control: authority, goal, setpoints, stiffness and mode."""
 
 from device_agent.ports.geometry import RobotGeometry
-from device_agent.protocol import Mode, StopLatch
+from device_agent.protocol import Mode, Setpoint, StopLatch
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.authority.authority import Authority
@@ -20,6 +20,7 @@ class ControlState:
     Attributes:
         mode: Mode of the last period.
         stops: Number of received Stops.
+        handed_over: Whether the robot moves itself.
     """
 
     def __init__(
@@ -39,6 +40,46 @@ class ControlState:
         self.authority = Authority(gate, latch, hold=self._hold, record=record)
         self.mode = Mode.IDLE
         self.stops = 0
+        self.handed_over = False
+
+    def restrict(self, source: str, speed: float, why: str) -> None:
+        """See ``Controller.restrict``. A robot that moves itself cannot be slowed, so it is held."""
+        self.authority.restrictions.set(source, speed, why)
+        allowed = self.authority.restrictions.speed
+        busy = self.authority.reservation is not None or self.goals.moving or self.stream.active
+        if busy and (allowed <= 0 or (self.handed_over and allowed < 1)):
+            self.authority.end(Refused("interlock", f"the room holds the device: {why}"))
+
+    def accept_setpoint(self, setpoint: Setpoint, *, now_s: float, tick_ms: int) -> None:
+        """See ``Controller.accept_setpoint``."""
+        lease = self.authority.lease(now_s)
+        if lease is None or setpoint.epoch != lease.epoch:
+            raise Refused("no_lease", f"lease {setpoint.epoch} is not in force")
+        self.stream.check(setpoint, tick_ms=tick_ms)
+        self.authority.check_input(setpoint.input)
+        try:
+            self.authority.check_free()
+        except Refused as refused:
+            if refused.code == "interlock":
+                self.authority.end(refused)
+            raise
+        if self.authority.reservation is not None or self.handed_over:
+            raise Refused("busy", "an action runs; cancel it first")
+        self.stream.accept(setpoint, now_s=now_s, tick_ms=tick_ms)
+
+    def hand_over(self) -> None:
+        """See ``Controller.hand_over``."""
+        strictest = self.authority.restrictions.strictest
+        if strictest is not None and strictest.speed < 1:
+            raise Refused(
+                "interlock", f"the room slows the device, and the robot cannot do this slower: {strictest.why}"
+            )
+        self.handed_over = True
+
+    def take_over(self) -> None:
+        """See ``Controller.take_over``."""
+        self.handed_over = False
+        self.stream.hold_here(self.motion.position_rad)
 
     def _hold(self, why: Refused) -> None:
         """Bring the device to rest after the right to move has ended."""

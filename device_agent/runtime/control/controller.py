@@ -91,11 +91,7 @@ class Controller:
             why: Reason, for operators.
         """
         with self._lock:
-            state = self._state
-            state.authority.restrictions.set(source, speed, why)
-            busy = state.authority.reservation is not None or state.goals.moving or state.stream.active
-            if state.authority.restrictions.speed <= 0 and busy:
-                state.authority.end(Refused("interlock", f"the room holds the device: {why}"))
+            self._state.restrict(source, speed, why)
 
     def lift(self, source: str) -> None:
         """Remove a source's restriction. Slowed motion continues at full speed; held motion does not resume."""
@@ -148,11 +144,7 @@ class Controller:
         The device has stopped itself for the reason of ``latch``. Until then Stop cannot be reset.
         """
         with self._lock:
-            authority = self._state.authority
-            if not (authority.device_stopped and authority.fault == latch.reason):
-                authority.set_fault(latch.reason, device_stopped=True)
-            if authority.latch is None:
-                authority.stop(latch)
+            self._state.authority.follow_device_stop(latch)
             self._state.goals.start_at(position_rad)
 
     # ------------------------------------------------------------ setpoints
@@ -165,33 +157,25 @@ class Controller:
                 holds the device, the lease also ends, so that the device does not start when a person leaves.
         """
         with self._lock:
-            state = self._state
-            lease = state.authority.lease(now_s)
-            if lease is None or setpoint.epoch != lease.epoch:
-                raise Refused("no_lease", f"lease {setpoint.epoch} is not in force")
-            state.stream.check(setpoint, tick_ms=tick_ms)
-            state.authority.check_input(setpoint.input)
-            try:
-                state.authority.check_free()
-            except Refused as refused:
-                if refused.code == "interlock":
-                    state.authority.end(refused)
-                raise
-            if state.authority.reservation is not None:
-                raise Refused("busy", "an action runs; cancel it first")
-            state.stream.accept(setpoint, now_s=now_s, tick_ms=tick_ms)
+            self._state.accept_setpoint(setpoint, now_s=now_s, tick_ms=tick_ms)
 
     # ------------------------------------------------------------ actions
 
-    def reserve(self, *, epoch: int, on_revoked: Callable[[Refused], None]) -> Reservation:
+    def reserve(self, *, epoch: int, on_revoked: Callable[[Refused], None], recovery: bool = False) -> Reservation:
         """Reserve the device for an action, until ``end_reservation`` or until its lease ends.
+
+        Args:
+            epoch: Epoch of the action's lease.
+            on_revoked: Called with the controller locked when the reservation is revoked.
+            recovery: Also while nothing may move: the action removes a fault, and its motion is still rejected.
 
         Raises:
             Refused: Stale or burned epoch, stopped, faulty, held by the room, or another action runs.
         """
         with self._lock:
             self._fence(epoch)
-            self._state.authority.check_free()
+            if not recovery:
+                self._state.authority.check_free()
             reservation = self._state.authority.reserve(epoch, on_revoked)
             self._state.stream.clear()
             return reservation
@@ -242,6 +226,21 @@ class Controller:
                 joint.name for joint, moves in zip(self._joints, moved, strict=True) if moves
             )
             return self._state.goals.start_trajectory(trajectory)
+
+    def hand_over(self, reservation: Reservation) -> None:
+        """Let the robot move itself until ``take_over``. Setpoints are rejected until then.
+
+        Raises:
+            Refused: The reservation has ended, stopped, faulty, or held or slowed by the room.
+        """
+        with self._lock:
+            self._check_goal(reservation)
+            self._state.hand_over()
+
+    def take_over(self) -> None:
+        """Hold at the positions that the driver applied last."""
+        with self._lock:
+            self._state.take_over()
 
     def start_drive(self, reservation: Reservation, twist: Twist, *, duration_s: float) -> DriveGoal:
         """Drive the base for ``duration_s`` [s]; then it brakes.

@@ -10,9 +10,10 @@ from device_agent.ports.clock import wall_ms
 from device_agent.ports.sensor import Camera, Capture, Movable, RoomDriver, SensorError, Values
 from device_agent.ports.uploads import UploadError, Uploads
 from device_agent.protocol.commands import CaptureRaw, CollectData, SetControl, TakePicture
-from device_agent.protocol.manifests.room import Control, RoomDeviceManifest
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.load import LoadGovernor
+from device_agent.runtime.room.controls import check_value
 from device_agent.runtime.room.stream_watchdog import StreamWatchdog
 
 _SUFFIXES = {"image/png": "png", "image/jpeg": "jpg", "application/json": "json"}
@@ -131,23 +132,11 @@ class RoomDevice:
         Raises:
             Refused: Unknown control, value not finite or out of range, or the device failed.
         """
-        control = self._control(name)
-        if not math.isfinite(value):
-            raise Refused("not_finite", f"{name} must be a finite number")
-        if not control.lower <= value <= control.upper:
-            limits = f"{control.lower:g} to {control.upper:g} {control.unit}".rstrip()
-            raise Refused("out_of_range", f"{name} can be {limits}, not {value:g}")
+        check_value(self.manifest.controls, name, value)
         try:
             return self.driver.set(name, value)
         except SensorError as error:
             raise Refused("sensor_failed", str(error)) from error
-
-    def _control(self, name: str) -> Control:
-        control = next((control for control in self.manifest.controls if control.name == name), None)
-        if control is None:
-            names = ", ".join(control.name for control in self.manifest.controls) or "none"
-            raise Refused("unknown_control", f"no control '{name}'; there are: {names}")
-        return control
 
     def capture_raw(self, name: str) -> dict[str, object]:
         """Capture raw data and upload it; returns the upload for the result.

@@ -4,19 +4,21 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.sandbox import SandboxStatus
+from device_agent.ports.skills import RobotBehaviour
 from device_agent.ports.tracing import CommandTraces, NoTraces
 from device_agent.protocol import (
     Ack,
     AckStatus,
     ActionState,
     BaseLimits,
+    Control,
     Description,
     Fault,
     InterlockDescription,
@@ -32,6 +34,7 @@ from device_agent.protocol import (
     Twin,
     camera_frames,
     codec,
+    description,
     topics,
 )
 from device_agent.protocol.camera_frames import CameraFrame
@@ -80,8 +83,8 @@ class StateSnapshot:
 class DevicePublisher:
     """Publisher of one device. Thread-safe.
 
-    Only the command processor calls ``publish_description``, ``publish_state``, ``repeat_acks`` and
-    ``update_journal``.
+    Only the command processor calls ``publish_description``, ``update_description``, ``publish_state``,
+    ``repeat_acks`` and ``update_journal``.
 
     Attributes:
         rejections: Number of rejections by code.
@@ -98,6 +101,8 @@ class DevicePublisher:
         simulated: bool,
         limits: Sequence[str],
         actions: Sequence[str],
+        robot_behaviours: Callable[[], tuple[RobotBehaviour, ...]] = tuple,
+        controls: Sequence[Control] = (),
         interlocks: Sequence[InterlockDescription],
         streaming: bool,
         journal: Journal,
@@ -113,6 +118,9 @@ class DevicePublisher:
         self._simulated = simulated
         self._limits = tuple(limits)
         self._actions = tuple(actions)
+        self._robot_behaviours = robot_behaviours
+        self._controls = tuple(controls)
+        self._described: tuple[RobotBehaviour, ...] | None = None
         self._interlocks = tuple(interlocks)
         self._streaming = streaming
         self._journal = journal
@@ -217,11 +225,20 @@ class DevicePublisher:
 
     def publish_description(self, twin: Twin | None) -> None:
         """Publish the description, and make the next state and undelivered acks due: the link is up."""
-        self._retain(self._topic(topics.DESC), self._description())
+        self._publish_description()
         if twin is not None:
             self._retain(self._topic(topics.DESC, topics.TWIN), twin)
         self._published_s = float("-inf")
         self._repeated, self._repeat_s, self._pause_s = 0, float("-inf"), FIRST_REPEAT_S
+
+    def update_description(self) -> None:
+        """Publish the description again if the robot's behaviours have changed since it was published."""
+        if self._described is not None and self._described != self._robot_behaviours():
+            self._publish_description()
+
+    def _publish_description(self) -> None:
+        self._described = own = self._robot_behaviours()
+        self._retain(self._topic(topics.DESC), self._description(own))
 
     def publish_state(self, snapshot: StateSnapshot, *, urgent: bool = False) -> None:
         """Publish ``state`` on change, at most once a second unless it is urgent, and every 30 s."""
@@ -277,7 +294,7 @@ class DevicePublisher:
     def _retain(self, topic: str, message: object) -> bool:
         return self._publish(topic, codec.encode(message, limit=codec.MAX_RETAINED_BYTES), qos=1, retain=True)
 
-    def _description(self) -> Description:
+    def _description(self, own: Sequence[RobotBehaviour]) -> Description:
         robot_type, room = self._robot_type, self._room_device
         return Description(
             device=self._name,
@@ -292,11 +309,14 @@ class DevicePublisher:
             actions=self._actions,
             postures=tuple(robot_type.postures),
             expressions=tuple(robot_type.expressions),
-            behaviours=tuple(robot_type.behaviours),
+            behaviours=(*robot_type.behaviours, *(each.name for each in own)),
+            robot_behaviours=tuple(
+                description.RobotBehaviour(name=each.name, label=each.title, recovery=each.recovery) for each in own
+            ),
             streams=robot_type.streams,
             cameras=robot_type.cameras if room is None else room.cameras,
             captures=() if room is None else room.captures,
-            controls=() if room is None else room.controls,
+            controls=self._controls if room is None else room.controls,
             watchdog_ms=round(WATCHDOG_S * 1000),
             max_loop_age_ms=round(MAX_LOOP_AGE_S * 1000),
             simulated=self._simulated,

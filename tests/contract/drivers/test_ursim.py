@@ -1,6 +1,9 @@
 """The driver at a controller's own software: URSim, or a real arm. See ``docs/robots/universal-robots.md``."""
 
 import os
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Iterator
 
@@ -8,16 +11,15 @@ import pytest
 
 from device_agent import drivers
 from device_agent.ports.driver import Driver, DriverError, ReportsFaults
+from device_agent.ports.skills import HasBehaviours
 from device_agent.protocol.manifests import robot_type as robot_types
-from tests.harness.paths import UR5
+from tests.harness.paths import ROOT, UR5
 
-ADDRESS = os.environ.get("TELESCOPE_URSIM", "")
+ADDRESS = os.environ.get("URSIM_HOST", "")
 TYPE = robot_types.load(UR5)
 STEP_RAD = 0.05
 SPEED_RAD_S = 0.1
 WITHIN_S = 20.0
-
-pytestmark = pytest.mark.skipif(not ADDRESS, reason="TELESCOPE_URSIM, the address of a controller, is not set")
 
 
 @pytest.fixture
@@ -39,6 +41,7 @@ def move(driver: Driver, target: tuple[float, ...]) -> None:
         time.sleep(TYPE.period_ms / 1000)
 
 
+@pytest.mark.ursim
 def test_a_controller_moves_halts_and_connects_again(driver: Driver) -> None:
     driver.connect()
     assert isinstance(driver, ReportsFaults)
@@ -55,3 +58,31 @@ def test_a_controller_moves_halts_and_connects_again(driver: Driver) -> None:
     time.sleep(0.5)  # longer than the program's watchdog
     assert max(map(abs, driver.observe().velocity_rad_s)) < 0.01
     assert not driver.faults()
+
+
+class Action:
+    """The context of a behaviour that nothing ends."""
+
+    ended = False
+
+    def wait(self, timeout_s: float) -> bool:
+        return threading.Event().wait(timeout_s)
+
+
+@pytest.mark.ursim
+def test_a_running_arm_confirms_the_recoveries_that_change_nothing(driver: Driver) -> None:
+    driver.connect()
+    assert isinstance(driver, HasBehaviours)
+    before = driver.observe().position_rad
+    for behaviour in driver.behaviours:
+        driver.run_behaviour(behaviour.name, Action())
+    assert driver.observe().position_rad == pytest.approx(before, abs=0.005)
+
+
+@pytest.mark.parametrize(("host", "selected"), [("", False), ("127.0.0.1", True)])
+def test_the_tests_at_a_controller_are_deselected_without_its_address(host: str, selected: bool) -> None:
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider", __file__]
+    environment = {**os.environ, "URSIM_HOST": host}
+    collected = subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True, text=True).stdout
+    assert ("test_a_controller_moves" in collected) is selected
+    assert ("2 deselected" in collected) is not selected

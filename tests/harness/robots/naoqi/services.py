@@ -18,6 +18,15 @@ SPEED_RAD_S = 2.0
 REST_RAD_S = 1e-6
 
 
+BEHAVIOURS: dict[str, list[tuple[float, dict[str, float]]]] = {
+    "animations/Stand/Gestures/Hey_1": [(0.6, {"RShoulderPitch": 0.3, "HeadYaw": 0.4}), (0.6, {"HeadYaw": 0.2})],
+    "User/long wave.1/behavior_1": [(60.0, {"HeadYaw": 1.9})],
+    "walk": [(60.0, {})],
+    "broken": [],
+}
+"""Installed behaviours: durations [s] and the targets of joints [rad]. ``walk`` walks; ``broken`` fails."""
+
+
 class Body:
     """The robot without its services. Physics continue while the services are disturbed."""
 
@@ -33,6 +42,7 @@ class Body:
         self.fallen, self.fall_manager, self.posture = False, True, "Standing"
         self.spoken, self.calls, self.language = [], [], "English"
         self.speaking = threading.Event()
+        self.running, self.stubborn = [], False
         self.disturbance, self.old_ms = "", 0
         self.rest_s: float | None = time.monotonic()
         threading.Thread(target=self.run, daemon=True).start()
@@ -63,6 +73,11 @@ class Body:
     def stop_itself(self):
         self.walk, self.target, self.fallen = [0.0, 0.0, 0.0], dict(self.position), True
         self.stiffness = dict.fromkeys(self.joints, 0.0)
+
+    def rest(self, names):
+        """End the motion of joints where they are."""
+        with self.lock:
+            self.target.update({name: self.commanded[name] for name in names})
 
     def command(self, name):
         """Whether to execute a command now."""
@@ -118,6 +133,15 @@ class ALMotion:
             self.body.command("stopMove")
             self.body.walk = [0.0, 0.0, 0.0]
 
+    def killTasksUsingResources(self, names):
+        self.body.rest(names)
+
+    def killAll(self):
+        with self.body.lock:
+            self.body.command("killAll")
+            self.body.walk = [0.0, 0.0, 0.0]
+            self.body.rest(self.body.joints)
+
     def moveIsActive(self):
         return any(self.body.twist)
 
@@ -169,6 +193,38 @@ class ALRobotPosture:
 
 
 @qi.multiThreaded()
+class ALBehaviorManager:
+    def __init__(self, body):
+        self.body = body
+
+    def getInstalledBehaviors(self):
+        return list(BEHAVIOURS)
+
+    def runBehavior(self, name):
+        if name not in BEHAVIOURS or name == "broken":
+            raise RuntimeError(f"runBehavior: '{name}' cannot be loaded")
+        self.body.running.append(name)
+        if name == "walk":
+            self.body.walk = [0.05, 0.0, 0.0]
+        for duration_s, targets in BEHAVIOURS[name]:
+            with self.body.lock:
+                self.body.fraction = 1.0
+                self.body.target.update(targets)
+            end_s = time.monotonic() + duration_s
+            while time.monotonic() < end_s and name in self.body.running:
+                time.sleep(0.005)
+        self.body.running = [each for each in self.body.running if each != name]
+
+    def isBehaviorRunning(self, name):
+        return name in self.body.running
+
+    def stopBehavior(self, name):
+        self.body.calls.append(f"stopBehavior {name}")
+        if not self.body.stubborn:
+            self.body.running = [each for each in self.body.running if each != name]
+
+
+@qi.multiThreaded()
 class ALBattery:
     def getBatteryCharge(self):
         return 81
@@ -207,7 +263,7 @@ class Nao:
         self.session = qi.Session()
         self.session.listenStandalone(self.url)
         self.url = self.session.endpoints()[0]
-        for service in (ALMotion, ALMemory, ALRobotPosture, ALTextToSpeech):
+        for service in (ALMotion, ALMemory, ALRobotPosture, ALTextToSpeech, ALBehaviorManager):
             self.session.registerService(service.__name__, service(self.body))
         self.session.registerService("ALBattery", ALBattery())
 
@@ -253,6 +309,7 @@ class Nao:
                 "spoken",
                 "calls",
                 "language",
+                "running",
             )
             return {name: getattr(body, name) for name in state}
 

@@ -15,7 +15,20 @@ _STOP_RAD_S2 = 25.0
 _LAG_S = 0.04
 STOPPED, PLAYING, PAUSED = 1, 2, 4
 NORMAL, PROTECTIVE_STOP, EMERGENCY_STOP = 1, 3, 7
-POWERED_OFF, RUNNING = 3, 7
+POWERED_OFF, IDLE, RUNNING = 3, 5, 7
+PICK = """\
+def pick():
+  q = get_target_joint_positions()
+  i = 0
+  while i < 100:
+    q[0] = q[0] + 0.005
+    servoj(q)
+    i = i + 1
+  end
+  stopj(10.0)
+end
+"""
+"""A program that turns the first joint by 0.5 rad in 0.8 s."""
 
 
 class Controller:
@@ -23,6 +36,11 @@ class Controller:
 
     Attributes:
         remote: Whether it takes programs from the network.
+        protective_s: When the present protective stop began [s].
+        files: Stored programs, by path.
+        loaded: Path of the loaded program.
+        digital_outputs: Digital outputs as bits: standard from 0, tool from 16; ``digital_inputs`` likewise.
+        outputs_follow: Whether outputs follow RTDE; False: a program controls them.
         each_cycle: Called after each cycle.
     """
 
@@ -37,6 +55,12 @@ class Controller:
         self.robot_mode = RUNNING
         self.runtime_state = STOPPED
         self.remote = True
+        self.protective_s = 0.0
+        self.files = {"pick.urp": PICK, "endless.urp": PICK.replace("i < 100", "i < 100000").replace("0.005", "0.001")}
+        self.loaded = ""
+        self.digital_outputs = 0
+        self.digital_inputs = 0b101
+        self.outputs_follow = True
         self.each_cycle: Callable[[Controller], None] = lambda _: None
         self.started_programs = 0
         self._program: Iterator[tuple[str, Any]] | None = None
@@ -82,6 +106,7 @@ class Controller:
     def set_safety_mode(self, mode: int) -> None:
         """Change the safety mode. A protective stop pauses the program, other stops end it."""
         self.safety_mode = mode
+        self.protective_s = self.time_s
         if mode == PROTECTIVE_STOP and self._program is not None:
             self.runtime_state = PAUSED
         elif mode != NORMAL:

@@ -1,4 +1,4 @@
-"""The emulated controller on loopback: RTDE and secondary interface on free ports, run by one thread."""
+"""The emulated controller on loopback: RTDE, secondary interface and dashboard on free ports, run by one thread."""
 
 import contextlib
 import socket
@@ -12,6 +12,7 @@ from device_agent.ports.driver import REST, Twist
 from device_agent.ports.threads import SupervisedThread
 from device_agent.protocol.manifests.robot_type import RobotType
 from tests.harness.robots.universal_robots.controller import CYCLE_S, NORMAL, PROTECTIVE_STOP, Controller
+from tests.harness.robots.universal_robots.dashboard_server import GREETING, DashboardSession
 from tests.harness.robots.universal_robots.rtde_server import RtdeServer, RtdeSession
 
 _WAIT_S = 60.0
@@ -30,8 +31,10 @@ class UrPeer:
         self._disturbance: Disturbance | None = None
         self._rtde_clients: dict[socket.socket, RtdeSession] = {}
         self._script_clients: dict[socket.socket, bytes] = {}
-        self._servers = [self._listen(0), self._listen(0)]
-        self.rtde_port, self.script_port = (server.getsockname()[1] for server in self._servers)
+        self._dashboard_clients: dict[socket.socket, DashboardSession] = {}
+        self.dashboard_commands: list[str] = []
+        self._servers = [self._listen(0), self._listen(0), self._listen(0)]
+        self.rtde_port, self.script_port, self.dashboard_port = (server.getsockname()[1] for server in self._servers)
         self._stopping = threading.Event()
         self._thread = SupervisedThread(self._run, name="peer", part="peer", stopping=self._stopping)
         self._thread.start()
@@ -72,7 +75,7 @@ class UrPeer:
         """See ``Peer``."""
         with self._lock:
             if self._disturbance is Disturbance.CONNECTION:
-                self._servers = [self._listen(self.rtde_port), self._listen(self.script_port)]
+                self._servers = [*map(self._listen, (self.rtde_port, self.script_port, self.dashboard_port))]
             if self._disturbance is Disturbance.SAFETY:
                 self.controller.set_safety_mode(NORMAL)
             self._disturbance = None
@@ -104,9 +107,9 @@ class UrPeer:
         return server
 
     def _disconnect(self) -> None:
-        for opened in (*self._servers, *self._rtde_clients, *self._script_clients):
+        for opened in (*self._servers, *self._rtde_clients, *self._script_clients, *self._dashboard_clients):
             opened.close()
-        self._rtde_clients, self._script_clients = {}, {}
+        self._rtde_clients, self._script_clients, self._dashboard_clients = {}, {}, {}
 
     def _run(self) -> None:
         while not self._stopping.wait(CYCLE_S):
@@ -128,15 +131,28 @@ class UrPeer:
             client.setblocking(False)
             client.send(_STATE)
             self._script_clients[client] = b""
+        with contextlib.suppress(OSError):
+            client, _ = self._servers[2].accept()
+            client.setblocking(False)
+            client.send(GREETING.encode())
+            self._dashboard_clients[client] = DashboardSession(self.controller, self.dashboard_commands)
 
     def _receive(self) -> None:
         for client, session in self._rtde_clients.items():
             with contextlib.suppress(OSError):
                 client.send(session.receive(client.recv(65536)))
+        for client, dashboard in list(self._dashboard_clients.items()):
+            with contextlib.suppress(OSError):
+                received = client.recv(65536)
+                if received:
+                    client.send(dashboard.receive(received))
+                else:
+                    client.close()
+                    del self._dashboard_clients[client]
         for client, text in list(self._script_clients.items()):
             with contextlib.suppress(OSError):
-                received = text + client.recv(65536)
-                program, end, rest = received.partition(b"\nend\n")
-                self._script_clients[client] = rest if end else received
+                script = text + client.recv(65536)
+                program, end, rest = script.partition(b"\nend\n")
+                self._script_clients[client] = rest if end else script
                 if end:
                     self.controller.run((program + end).decode())

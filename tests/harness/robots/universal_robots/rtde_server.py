@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from device_agent.drivers.testing.peer import Disturbance
 from tests.harness.robots.universal_robots.controller import CYCLE_S, JOINTS, Controller
 
-_TYPES = {"DOUBLE": "d", "VECTOR6D": "6d", "INT32": "i", "UINT32": "I"}
+_TYPES = {"DOUBLE": "d", "VECTOR6D": "6d", "INT32": "i", "UINT32": "I", "UINT64": "Q", "UINT8": "B"}
 _OUTPUT_TYPES = {
     "timestamp": "DOUBLE",
     "actual_q": "VECTOR6D",
@@ -17,11 +17,17 @@ _OUTPUT_TYPES = {
     "robot_mode": "INT32",
     "safety_mode": "INT32",
     "runtime_state": "UINT32",
+    "actual_digital_input_bits": "UINT64",
+    "actual_digital_output_bits": "UINT64",
+    "tool_analog_input0": "DOUBLE",
+    "tool_analog_input1": "DOUBLE",
+    "tool_output_voltage": "INT32",
     **{f"output_int_register_{index}": "INT32" for index in range(48)},
 }
 _INPUT_TYPES = {
     **{f"input_int_register_{index}": "INT32" for index in range(48)},
     **{f"input_double_register_{index}": "DOUBLE" for index in range(48)},
+    **{f"{bank}_digital_output{part}": "UINT8" for bank in ("standard", "tool") for part in ("_mask", "")},
 }
 TEXT_MESSAGE = b"\x05Hello\x04Test\x03"
 
@@ -63,6 +69,11 @@ class RtdeServer:
             "robot_mode": [controller.robot_mode],
             "safety_mode": [controller.safety_mode],
             "runtime_state": [controller.runtime_state],
+            "actual_digital_input_bits": [controller.digital_inputs],
+            "actual_digital_output_bits": [controller.digital_outputs],
+            "tool_analog_input0": [1.5],
+            "tool_analog_input1": [0.25],
+            "tool_output_voltage": [24],
         }
         values: list[float] = []
         for name in names:
@@ -71,6 +82,12 @@ class RtdeServer:
 
     def write(self, names: Sequence[str], values: Sequence[float]) -> None:
         """Write inputs."""
+        if names[0].endswith("_digital_output_mask"):
+            shift = 16 if names[0].startswith("tool") else 0
+            mask, bits = int(values[0]) << shift, int(values[1]) << shift
+            if self.controller.outputs_follow:
+                self.controller.digital_outputs = self.controller.digital_outputs & ~mask | bits & mask
+            return
         for name, value in zip(names, values, strict=True):
             index = int(name.rpartition("_")[2])
             if "_int_" in name:

@@ -8,12 +8,13 @@ import { HealthChip } from "../../features/health";
 import { PageExplainer } from "../../features/help";
 import { CommandTraceCard } from "../../features/latency";
 import { MovementsCard } from "../../features/movements";
-import { CameraSwitcher, useCameraSources } from "../../features/sensors";
+import { CameraSwitcher, SettingsCard, useCameraSources } from "../../features/sensors";
+import { RoomDeviceAction } from "../../features/sensors/model";
 import { AccessList, goToAccess } from "../../features/sharing";
 import { SteeringCard } from "../../features/steering";
 import { JointPoseTable, TelemetryPlot, TwinView } from "../../features/twin";
 import type { ComponentChildren } from "preact";
-import { useRef } from "preact/hooks";
+import { useMemo, useRef } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { common } from "../../shared/i18n/common";
 import { RoomDevicePage } from "./room-device-page";
@@ -108,6 +109,8 @@ function RobotColumns({ api, fleet, session, account, access }: RobotColumnsProp
   const { device, control, actions } = session;
   const views = useCameraSources(fleet, device);
   const type = device.info.value.robot_type;
+  const settings = useMemo(() => new RoomDeviceAction(api, device, actions, () => control.epoch), [api, device, actions, control]);
+  const hasSettings = (device.description.value?.controls.length ?? 0) > 0;
   return (
     <div class="desk robot">
       <div class="column">
@@ -136,6 +139,11 @@ function RobotColumns({ api, fleet, session, account, access }: RobotColumnsProp
       </div>
       <div class="column">
         <ActionCards fleet={fleet} session={session} />
+        {hasSettings && (
+          <CollapsibleCard name="settings" title={texts.cards.settings} type={type}>
+            <SettingsCard device={device} roomAction={settings} />
+          </CollapsibleCard>
+        )}
         <CollapsibleCard name="movements" title={texts.cards.movements} type={type}>
           <MovementsCard api={api} device={device} control={control} actions={actions} account={account.id} />
         </CollapsibleCard>

@@ -1,5 +1,5 @@
 /** Action cards of a robot: one for each capability in its description. */
-import { actionUnavailableReason } from "../devices";
+import { actionUnavailableReason, recoveryUnavailableReason } from "../devices";
 import type { DeviceSession } from "../control/model";
 import type { Fleet } from "../devices/model";
 import { Card } from "../../shared/ui/card";
@@ -12,7 +12,8 @@ import "./actions.css";
 import { LookAtCard } from "./look-at-card";
 import { GoToPlaceCard } from "./go-to-place-card";
 import { MoveToPoseCard } from "./move-to-pose-card";
-import { BehavioursCard, ExpressionsCard, PosturesCard } from "./one-click-actions-card";
+import { behaviourButtons } from "./model";
+import { BehavioursCard, ExpressionsCard, PosturesCard, RecoveriesCard } from "./one-click-actions-card";
 import { SpeechCard } from "./speech-card";
 import { StiffnessCard } from "./stiffness-card";
 
@@ -34,10 +35,13 @@ export function ActionCards({ fleet, session }: ActionCardsProps) {
   const disabledReason = actionUnavailableReason(session.device, session.control);
   const common: ActionCardProps = { session, description, disabledReason };
   const supports = (kind: AnyRequest["kind"]): boolean => description.actions.includes(kind);
-  const cards: [string, string, boolean, ComponentChildren][] = [
+  const { behaviours, recoveries } = behaviourButtons(description);
+  const recovering = { ...common, disabledReason: recoveryUnavailableReason(session.device, session.control) };
+  const cards: [string, string, boolean, ComponentChildren, string?][] = [
+    ["recoveries", texts.recoveries, recoveries.length > 0, <RecoveriesCard {...recovering} />, recovering.disabledReason],
     ["postures", texts.postures, supports("take_posture") && description.postures.length > 0, <PosturesCard {...common} />],
     ["expressions", texts.expressions, supports("express") && description.expressions.length > 0, <ExpressionsCard {...common} />],
-    ["behaviours", texts.behaviours, supports("run_behaviour") && description.behaviours.length > 0, <BehavioursCard {...common} />],
+    ["behaviours", texts.behaviours, supports("run_behaviour") && behaviours.length > 0, <BehavioursCard {...common} />],
     ["speech", texts.speech, supports("say"), <SpeechCard {...common} />],
     ["pose", texts.pose, supports("move_pose"), <MoveToPoseCard {...common} />],
     ["place", texts.place, supports("go_to"), <GoToPlaceCard {...common} fleet={fleet} />],
@@ -47,10 +51,10 @@ export function ActionCards({ fleet, session }: ActionCardsProps) {
   return (
     <>
       {cards.map(
-        ([name, title, available, card]) =>
+        ([name, title, available, card, reason = disabledReason]) =>
           available && (
             <CollapsibleCard key={name} name={name} title={title} type={description.robot_type}>
-              <Card title={title} class="act" aside={disabledReason === "" ? undefined : <span class="quiet small act-no">{disabledReason}</span>}>
+              <Card title={title} class="act" aside={reason === "" ? undefined : <span class="quiet small act-no">{reason}</span>}>
                 {card}
               </Card>
             </CollapsibleCard>

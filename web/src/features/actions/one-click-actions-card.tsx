@@ -4,17 +4,18 @@ import type { AnyRequest } from "../../shared/api/action-requests";
 import { texts } from "./texts";
 import { startAction, type ActionCardProps } from "./action-cards";
 import { FractionField } from "./action-form-fields";
+import { type BehaviourButton, behaviourButtons } from "./model";
 
 interface ButtonsProps extends ActionCardProps {
-  names: readonly string[];
+  buttons: readonly BehaviourButton[];
   testid: string;
   request: (name: string) => AnyRequest;
 }
 
-function Buttons({ session, disabledReason, names, testid, request }: ButtonsProps) {
+function Buttons({ session, disabledReason, buttons, testid, request }: ButtonsProps) {
   return (
     <div class="act-buttons">
-      {names.map((name) => (
+      {buttons.map(({ name, label }) => (
         <button
           key={name}
           type="button"
@@ -23,12 +24,14 @@ function Buttons({ session, disabledReason, names, testid, request }: ButtonsPro
           title={disabledReason === "" ? undefined : disabledReason}
           onClick={() => startAction(session, request(name))}
         >
-          {name}
+          {label}
         </button>
       ))}
     </div>
   );
 }
+
+const named = (names: readonly string[]): BehaviourButton[] => names.map((name) => ({ name, label: name }));
 
 export function PosturesCard(props: ActionCardProps) {
   const [speed, setSpeed] = useState(0.5);
@@ -36,7 +39,7 @@ export function PosturesCard(props: ActionCardProps) {
     <>
       <Buttons
         {...props}
-        names={props.description.postures}
+        buttons={named(props.description.postures)}
         testid="posture"
         request={(name) => ({ kind: "take_posture", name, speed })}
       />
@@ -49,10 +52,25 @@ export function BehavioursCard(props: ActionCardProps) {
   return (
     <Buttons
       {...props}
-      names={props.description.behaviours}
+      buttons={behaviourButtons(props.description).behaviours}
       testid="behaviour"
       request={(name) => ({ kind: "run_behaviour", name })}
     />
+  );
+}
+
+/** Recoveries of a robot that has stopped itself. */
+export function RecoveriesCard(props: ActionCardProps) {
+  return (
+    <>
+      <p class="quiet small">{texts.recoveriesNote}</p>
+      <Buttons
+        {...props}
+        buttons={behaviourButtons(props.description).recoveries}
+        testid="recovery"
+        request={(name) => ({ kind: "run_behaviour", name })}
+      />
+    </>
   );
 }
 
@@ -62,7 +80,7 @@ export function ExpressionsCard(props: ActionCardProps) {
     <>
       <Buttons
         {...props}
-        names={props.description.expressions}
+        buttons={named(props.description.expressions)}
         testid="expression"
         request={(name) => ({ kind: "express", name, strength })}
       />

@@ -3,8 +3,10 @@ import type { Control } from "../control/model";
 import { actionUnavailableReason } from "../devices";
 import type { DeviceStore } from "../devices/model";
 import { useState } from "preact/hooks";
+import { behaviourLabel } from "./model";
 import { ended, released, type ActionRunner, type Run } from "./model/action-runner";
 import { format } from "../../shared/i18n/format";
+import type { KnownDescription } from "../../shared/mqtt/parse-messages";
 import { describeRequest, texts } from "./texts";
 import "./run-status.css";
 
@@ -28,8 +30,8 @@ export function RunStatusPanel({ device, control, actions }: RunStatusProps) {
   return (
     <div class={`run-status ${ownRunning || otherAction !== null ? "running" : ""} ${visible ? "" : "empty"}`}>
       <div class={`run run-${run?.status ?? "none"}`} role="status" data-testid="action-status" data-status={run?.status ?? ""}>
-        {run !== null && <RunSteps run={run} />}
-        {otherAction !== null && <p>{texts.running(otherAction.kind, otherAction.name ?? "")}</p>}
+        {run !== null && <RunSteps run={run} description={device.description.value} />}
+        {otherAction !== null && <p>{texts.running(otherAction.kind, behaviourLabel(device.description.value, otherAction.name ?? ""))}</p>}
         {error !== "" && <p class="field-error">{error}</p>}
       </div>
       <div class="row">
@@ -60,8 +62,8 @@ export function RunStatusPanel({ device, control, actions }: RunStatusProps) {
 }
 
 /** The request, its steps and its progress. */
-export function RunSteps({ run }: { run: Run }) {
-  const name = describeRequest(run.request);
+export function RunSteps({ run, description = null }: { run: Run; description?: KnownDescription | null }) {
+  const name = behaviourLabel(description, describeRequest(run.request));
   return (
     <>
       <strong>{name}</strong>

@@ -37,6 +37,8 @@ export const texts = {
   postures: "Postures",
   expressions: "Expressions",
   behaviours: "Behaviours",
+  recoveries: "Recovery",
+  recoveriesNote: "Look at the robot and remove the cause first. A recovery moves no joints. Reset Stop afterwards.",
   speech: "Speech",
   pose: "Move to pose",
   place: "Go to position",

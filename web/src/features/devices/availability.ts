@@ -5,11 +5,25 @@ import { texts } from "./texts";
 
 /** Why the device is unavailable, or "". */
 export function unavailableReason(device: DeviceStore): string {
+  const reason = unreachableReason(device);
+  return reason === "" && device.stopped.value ? texts.unavailable.stopped : reason;
+}
+
+function unreachableReason(device: DeviceStore): string {
   if (device.info.value.role === "viewer") return texts.unavailable.viewer;
   const { incompatible } = device.info.value;
   if (incompatible !== null) return incompatible;
   if (device.reach.value === "offline" || device.reach.value === "unknown") return texts.unavailable.offline;
-  if (device.stopped.value) return texts.unavailable.stopped;
+  return "";
+}
+
+/** Why a recovery is unavailable, or "". It may be started while Stop is latched, and during a fault. */
+export function recoveryUnavailableReason(device: DeviceStore, control: Control): string {
+  const reason = unreachableReason(device);
+  if (reason !== "") return reason;
+  if (device.live.value && (device.state.value?.action ?? null) !== null) return texts.unavailable.busy;
+  const holder = device.holder.value;
+  if (holder !== null && !holder.mine && control.epoch === null) return texts.unavailable.held(holder.name);
   return "";
 }
 

@@ -1,4 +1,4 @@
-export { actionUnavailableReason, unavailableReason } from "./availability";
+export { actionUnavailableReason, recoveryUnavailableReason, unavailableReason } from "./availability";
 export { DeviceLists, faultsOf } from "./device-list";
 export { EventLog } from "./event-log";
 export { RateNotice } from "./rate-notice";

@@ -86,6 +86,7 @@ export const texts = {
     poses: "Joint frames",
     steering: "Steering",
     latency: "Latency",
+    settings: "Settings",
     movements: "Movements",
     keyframes: "Keyframes",
     access: "Access",

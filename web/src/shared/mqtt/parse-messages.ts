@@ -10,7 +10,7 @@ import type { Pose, Quaternion, Vector3 } from "../lib/vectors";
 import type {
   Ack, AckStatus, ActionState, BaseLimits, Body, Control, Description, Diagnostic, Event, Fault, Geometry,
   InterlockDescription, Joint, JointTelemetry, LeaseState, Measurements, MimicJoint, Mode, PositionDependentLimit,
-  OpenRequest, Presence, Reason, Restriction, State, StopLatch, Stream, TwinJoint, VersionRange,
+  OpenRequest, Presence, Reason, Restriction, RobotBehaviour, State, StopLatch, Stream, TwinJoint, VersionRange,
 } from "./protocol.generated";
 
 /** Largest message of the contract [bytes]. */
@@ -59,6 +59,8 @@ const control = object<Required<Control>>({
   upper: number,
 });
 
+const robotBehaviour = object<Required<RobotBehaviour>>({ name: text, label: text, recovery: optional(flag, false) });
+
 const diagnostic = object<Required<Diagnostic>>({
   stream: optional(text, ""),
   fields: text,
@@ -88,6 +90,7 @@ const description = object<KnownDescription>({
   postures: optional(list(text, MAX_JOINTS), []),
   expressions: optional(list(text, MAX_JOINTS), []),
   behaviours: optional(list(text, MAX_JOINTS), []),
+  robot_behaviours: optional(list(robotBehaviour, MAX_JOINTS), []),
   streams: optional(list(stream, MAX_JOINTS), []),
   cameras: optional(list(stream, MAX_JOINTS), []),
   captures: optional(list(text, MAX_JOINTS), []),
@@ -238,7 +241,8 @@ function read<T>(payload: Uint8Array, check: Check<T>, name: string): T {
 
 export type KnownDiagnostic = Required<Diagnostic>;
 
-export type KnownDescription = Required<Omit<Description, "diagnostics" | "mimic_joints">> & {
+export type KnownDescription = Required<Omit<Description, "diagnostics" | "mimic_joints" | "robot_behaviours">> & {
+  robot_behaviours: Required<RobotBehaviour>[];
   diagnostics: KnownDiagnostic[];
   mimic_joints: Required<MimicJoint>[];
 };

@@ -35,6 +35,7 @@ export interface VersionRange {
  * position_dependent_limits: Joint ranges that depend on other joints.
  * actions: Kinds of actions that the device accepts. `postures`, `expressions` and `behaviours` list the
  * names that such actions may use. Empty for older agents.
+ * robot_behaviours: Those of the `behaviours` that the robot itself provides.
  * cameras: Camera streams at `cam/{name}`.
  * captures: Raw data that can be captured.
  * controls: Values that can be set.
@@ -66,6 +67,7 @@ export interface Description {
   postures?: string[];
   expressions?: string[];
   behaviours?: string[];
+  robot_behaviours?: RobotBehaviour[];
   streams?: Stream[];
   cameras?: Stream[];
   captures?: string[];
@@ -128,6 +130,22 @@ export interface PositionDependentLimit {
   /** no control and format characters */
   depends_on: string;
   table: [number, number, number][];
+}
+
+/**
+ * A behaviour that the robot itself provides. It moves its joints without the agent's limits.
+ *
+ * Attributes:
+ * name: Name for `run_behaviour`; also listed in `behaviours`.
+ * label: The robot's own name of it.
+ * recovery: Whether it removes a fault. It moves no joints, and may be started while Stop is latched.
+ */
+export interface RobotBehaviour {
+  /** letters, digits, _ and -, 1 to 64 of them */
+  name: string;
+  /** no control and format characters */
+  label: string;
+  recovery?: boolean;
 }
 
 /** A stream at `tele/{name}`: `joints` carries `JointTelemetry`, all others `Measurements`. */

@@ -99,14 +99,14 @@ def test_a_stop_is_latched_and_recorded() -> None:
 def test_stop_is_not_reset_while_the_device_has_stopped_itself() -> None:
     fixture = Fixture(latch=LATCH)
     fixture.grant(3)
-    fixture.authority.set_fault("it hit something", device_stopped=True)
+    fixture.authority.follow_device_stop(LATCH)
     with refuses("device_stopped"):
         fixture.authority.reset_stop()
     assert fixture.authority.latch == LATCH
     fixture.authority.set_fault("no answer")  # the device is lost: whether it has stopped itself is unknown
     fixture.authority.reset_stop()
-    fixture.authority.stop(LATCH)
-    fixture.authority.set_fault("it hit something", device_stopped=True)
+    fixture.authority.follow_device_stop(LATCH)
+    assert fixture.authority.fault == LATCH.reason
     fixture.authority.clear_fault()
     fixture.authority.reset_stop()
     assert fixture.authority.latch is None
