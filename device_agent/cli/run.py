@@ -151,11 +151,7 @@ def _export_traces(environment: Mapping[str, str]) -> CommandTraces:
 
 
 def _run_until_unpaired(
-    store: IdentityStore,
-    trace: Path | None,
-    metrics: "AgentMetrics | None",
-    traces: CommandTraces,
-    trial: Trial | None,
+    store: IdentityStore, trace: Path | None, metrics: "AgentMetrics | None", traces: CommandTraces, trial: Trial | None
 ) -> int | None:
     """Run with the saved pairing. Returns the exit code, or ``None`` if the pairing is no longer valid."""
     stop = threading.Event()

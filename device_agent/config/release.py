@@ -14,11 +14,7 @@ JOURNAL_FORMAT, OUTBOX_FORMAT, PAIRING_FORMAT = 1, 1, 1
 A format grows only with a change that older releases cannot read. First a release reads the new format, and only a
 later one writes it (``WRITTEN``), so that the release before can always be used again.
 """
-READ: Mapping[str, int] = {
-    "journal.db": JOURNAL_FORMAT,
-    "outbox.db": OUTBOX_FORMAT,
-    "pairing.json": PAIRING_FORMAT,
-}
+READ: Mapping[str, int] = {"journal.db": JOURNAL_FORMAT, "outbox.db": OUTBOX_FORMAT, "pairing.json": PAIRING_FORMAT}
 WRITTEN: Mapping[str, int] = {"journal.db": 1, "outbox.db": 1, "pairing.json": 1}
 """Formats that this release writes."""
 

@@ -102,7 +102,17 @@ def download(pin: Pin, target: Target, wheels: Path, own: Path | None) -> bool:
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as file:
         file.write(f"{pin.name}=={pin.version} {' '.join(f'--hash={each}' for each in pin.hashes)}\n")
         file.flush()
-        command = [*_PIP, "download", "--quiet", "--no-deps", "--require-hashes", "--dest", str(wheels), "-r", file.name]
+        command = [
+            *_PIP,
+            "download",
+            "--quiet",
+            "--no-deps",
+            "--require-hashes",
+            "--dest",
+            str(wheels),
+            "-r",
+            file.name,
+        ]
         done = None
         if pin.name not in target.compiled:
             done = subprocess.run([*command, *target.options], capture_output=True, text=True, check=False)  # noqa: S603
@@ -132,9 +142,7 @@ def write_lists(folder: Path, target: Target, *, version: str, compiled: list[st
     builders -= {pin.name for pin in pins(_read("agent"), target)}
     lines = []
     for file in sorted((folder / "wheels").iterdir()):
-        name, number = (
-            parse_wheel_filename(file.name)[:2] if file.suffix == ".whl" else parse_sdist_filename(file.name)
-        )
+        name, number = parse_wheel_filename(file.name)[:2] if file.suffix == ".whl" else parse_sdist_filename(file.name)
         if name not in builders:
             lines.append(f"{name}=={number} --hash=sha256:{_digest(file)}\n")
     (folder / "requirements.txt").write_text("".join(lines), encoding="utf-8")

@@ -36,12 +36,7 @@ class ControlServer:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        permission: RestartPermission,
-        *,
-        linked: Callable[[], bool],
-        restart: Callable[[], None],
+        self, folder: Path, permission: RestartPermission, *, linked: Callable[[], bool], restart: Callable[[], None]
     ) -> None:
         self._folder = folder
         self._permission = permission
