@@ -1,4 +1,4 @@
-"""The installation that ``install-agent.sh`` made: releases side by side, and links to the one in use and the one before.
+"""The installation that ``install-agent.sh`` made: releases side by side, and links to the one in use and the former one.
 
 PREFIX/
     installation           home of the agent, user and unit of the service
@@ -73,8 +73,8 @@ class Installation:
         prefix = Path(sys.prefix).resolve().parent.parent
         if not (prefix / SETTINGS_FILE).is_file():
             raise ConfigError(
-                "this agent was not installed by install-agent.sh, so it cannot update itself. Stop the agent, then use "
-                "`pipx upgrade telescope-agent`, or the program that installed it"
+                "this agent was not installed by install-agent.sh, so it cannot update itself. Stop the agent, then "
+                "use `pipx upgrade telescope-agent`, or the program that installed it"
             )
         return cls(prefix)
 

@@ -80,7 +80,6 @@ class Switch:
 
     def _switch_stopped(self, version: str) -> str:
         """Switch while no agent runs. The release is on trial from its next start."""
-        installation = self._installation
         with self._no_agent_runs():
             self._link(version, needs_link=False)
         return f"release {version} is in use from the next start of the agent, which was not running"

@@ -23,7 +23,7 @@ class StubInstallation:
         for version in versions:
             self.add(version)
         self.installation = Installation(self.prefix)
-        self.installation.link("current", versions[0])
+        self.installation.link("current", versions[0] if versions else "")
 
     def add(self, version: str, script: str = "") -> None:
         """Install a release; ``script`` runs before it prints its version."""
