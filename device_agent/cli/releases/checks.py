@@ -11,7 +11,7 @@ from device_agent.cli.releases.installation import Installation
 from device_agent.config import release
 from device_agent.config.errors import ConfigError
 
-LOW_PRIORITY = ("nice", "-n", "19")
+LOW_PRIORITY = ("nice", "-n", "5")
 """Prefix of commands that run beside control loops."""
 _TIMEOUT_S = 300.0
 

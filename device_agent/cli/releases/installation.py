@@ -1,4 +1,4 @@
-"""The installation that ``install-agent.sh`` made: releases side by side, and links to the one in use and the former one.
+"""Releases side by side, as ``install-agent.sh`` installs them, and links to two of them.
 
 PREFIX/
     installation           home of the agent, user and unit of the service

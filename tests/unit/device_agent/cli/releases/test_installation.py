@@ -44,7 +44,8 @@ def test_a_link_is_replaced_and_removed(stub: StubInstallation) -> None:
 
 
 def test_two_programs_cannot_change_it_at_once(stub: StubInstallation) -> None:
-    with stub.installation.lock(), pytest.raises(ConfigError, match="another program changes"), stub.installation.lock():
+    again = stub.installation.lock()
+    with stub.installation.lock(), pytest.raises(ConfigError, match="another program changes"), again:
         pass
     with stub.installation.lock():
         pass
