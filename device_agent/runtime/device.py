@@ -278,7 +278,7 @@ class Device:
         """Reject grants, actions and motion with the reason ``why`` until ``resume``; Stop still latches.
 
         Returns:
-            What prevents it, or an empty string: nobody has control, nothing moves and the journal is on disk.
+            What prevents it, or an empty string: no lease is in force, nothing moves and the journal is on disk.
         """
         reason = self._controller.suspend(why, time.monotonic())
         if reason:

@@ -27,8 +27,8 @@ def add_commands(commands: Commands, _home: Path) -> None:
     update = commands.add_parser(
         "update",
         help="install another release beside this one and switch to it while no device moves",
-        description="Installs a release, checks it, and waits until no device moves and nobody has control. Then the "
-        "agent restarts with it. If it does not work, the former release is used again.",
+        description="Installs a release, checks it, and waits until no device moves and no operator has control. Then "
+        "the agent restarts with it. If it does not work, the former release is used again.",
     )
     update.add_argument("--version", help="version from PyPI (default: the newest)")
     update.add_argument("--bundle", type=Path, help="offline bundle: an archive of `make agent-bundle`, or its folder")

@@ -126,10 +126,27 @@ class InstalledAgent:
             command += ["--user", "root"]
         return subprocess.run([*command, *options], capture_output=True, text=True, check=False)
 
+    def clone(self, source: str, version: str, changes: Mapping[str, tuple[str, str]]) -> None:
+        """Install a copy of a release with another version and these changes; see ``bundle``."""
+        before, after = (self.prefix / "releases" / each for each in (source, version))
+        shutil.copytree(before, after, symlinks=True, ignore=shutil.ignore_patterns("__pycache__", "pip"))
+        program = after / "bin/telescope-agent"
+        program.write_text(program.read_text().replace(str(before), str(after)))
+        packages = next(after.glob("lib/python*/site-packages"))
+        for name, (old, new) in {**changes, _VERSION_FILE: (f'"{source}"', f'"{version}"')}.items():
+            text = (packages / name).read_text()
+            assert old in text, f"{name} does not contain {old!r}"
+            (packages / name).write_text(text.replace(old, new, 1))
+
     def run(self, *arguments: str) -> "subprocess.CompletedProcess[str]":
         """Run a command of the installed agent, outside the repository."""
         return subprocess.run(
-            [self.program, *arguments], cwd="/", env=_environment_variables(), capture_output=True, text=True, check=False
+            [self.program, *arguments],
+            cwd="/",
+            env=_environment_variables(),
+            capture_output=True,
+            text=True,
+            check=False,
         )
 
     def begin(self, *arguments: str) -> "subprocess.Popen[str]":

@@ -14,10 +14,13 @@ from tests.harness.agent.pairing import paired_arm
 from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
 from tests.harness.network.brokers import wait_until
 
-SLOW = {"kind": "move_joints", "position_rad": {"shoulder_pan": 0.6}, "speed": 0.1}
+LONG = {"kind": "move_joints", "position_rad": {"shoulder_pan": 2.0}, "speed": 0.002}
+"""A motion that lasts until the test cancels it."""
 FAST = {"kind": "move_joints", "position_rad": {"shoulder_pan": 0.0}, "speed": 1.0}
 BROKEN = {"device_agent/bootstrap.py": ("        self._sandbox.start()\n", "        raise OSError('no driver')\n")}
 """A release that passes its self-test, and ends when it starts its devices."""
+
+pytestmark = pytest.mark.timeout(1800)  # on a busy machine, the programs of an update start slowly
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +35,14 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def start(processes: CloudProcesses, device: str, request: Any, *, until: str) -> dict[str, Any]:
-    action: dict[str, Any] = processes.anna.start(device, request=request, wait_ms=30_000, wait_for=until).json()
+    """Start an action; returns it in this state."""
+    action: dict[str, Any] = processes.anna.start(device, request=request, timeout_ms=1_800_000).json()
+
+    def reached() -> bool:
+        action.update(processes.anna.get(f"/actions/{action['id']}").json())
+        return action["status"] == until or action["status"] in {"done", "failed", "cancelled", "expired"}
+
+    wait_until(reached, f"the action to be {until}")
     return action
 
 
@@ -58,41 +68,34 @@ def test_an_update_waits_for_rest_and_a_broken_release_is_rolled_back(
         wait_until(lambda: release_of(agent) == "0.1.0" and online(processes, device), "the agent")
         _update_in_motion(processes, agent, device, bundle(tmp_path, wheel, "0.2.0"))
         _reject_motion_in_the_window(processes, agent, device)
-        broken = agent.run("update", "--bundle", str(bundle(tmp_path, wheel, "0.3.0", BROKEN)))
+        agent.clone("0.2.0", "0.3.0", BROKEN)
+        broken = agent.run("rollback", "--version", "0.3.0")
         assert broken.returncode == 1, broken
         assert "release 0.3.0 failed (it ended 3 times before it was ready); release 0.2.0 is in use" in broken.stderr
         wait_until(lambda: release_of(agent) == "0.2.0" and online(processes, device), "the former release")
         assert start(processes, device, FAST, until="done")["status"] == "done"
-        back = agent.run("rollback", "--version", "0.1.0")
-        assert back.returncode == 0, back
-        assert release_of(agent) == "0.1.0"
-        wait_until(lambda: online(processes, device), "the agent")
-        assert start(processes, device, FAST, until="done")["status"] == "done"
 
 
 def _update_in_motion(processes: CloudProcesses, agent: InstalledAgent, device: str, new: Path) -> None:
-    """Run the update while the arm moves: the motion ends first, undisturbed."""
-    action = start(processes, device, SLOW, until="started")
+    """Run the update while the arm moves: it waits, and the motion goes on until its operator ends it."""
+    action = start(processes, device, LONG, until="started")
     assert action["status"] == "started", action
     running = agent.pid
     update = agent.begin("update", "--bundle", str(new))
     assert update.stdout is not None
-    for line in update.stdout:
-        if line.startswith("waiting: arm: "):
-            break
-    else:
-        pytest.fail("the update did not wait")
+    output = ""
+    while "waiting: arm: " not in output:
+        line = update.stdout.readline()
+        assert line, output
+        output += line
     moving = processes.anna.get(f"/actions/{action['id']}").json()
-    assert (moving["status"], agent.pid) == ("started", running)
-    ended = processes.anna.get(f"/actions/{action['id']}?wait_ms=30000&wait_for=done").json()
-    wait_until(
-        lambda: processes.anna.get(f"/actions/{action['id']}").json()["status"] != "started", "the end of the motion"
-    )
-    ended = processes.anna.get(f"/actions/{action['id']}").json()
-    assert ended["status"] == "done", ended
-    assert ended["result"]["position_rad"]["shoulder_pan"] == pytest.approx(0.6, abs=0.03)
-    output = update.stdout.read()
+    assert (moving["status"], agent.pid, agent.starts) == ("started", running, 1), output
+    assert processes.anna.post(f"/actions/{action['id']}/cancel").status_code < 300
+    output += update.stdout.read()
     assert update.wait() == 0, output
+    ended = processes.anna.get(f"/actions/{action['id']}").json()
+    assert ended["status"] == "cancelled", "no restart ended the motion"
+    assert 0.001 < ended["result"]["position_rad"]["shoulder_pan"] < 2.0
     assert "release 0.2.0 is in use and works" in output
     assert (release_of(agent), agent.starts) == ("0.2.0", 2)
     wait_until(lambda: online(processes, device), "the new release to be online")
@@ -104,7 +107,7 @@ def _reject_motion_in_the_window(processes: CloudProcesses, agent: InstalledAgen
     permission = client.call(agent.home, ControlRequest(kind="request-restart"))
     assert permission is not None
     assert permission.ok, permission.reason
-    rejected = start(processes, device, SLOW, until="done")
+    rejected = start(processes, device, LONG, until="done")
     assert (rejected["status"], rejected["reason"]["code"]) == ("failed", "restarting"), json.dumps(rejected)
     assert "about to restart for an update" in rejected["reason"]["message"]
     cancelled = client.call(agent.home, ControlRequest(kind="cancel-restart", token=permission.token))

@@ -96,9 +96,7 @@ def test_a_malformed_request_is_rejected_and_changes_nothing(fixture: Fixture, p
     assert not fixture.suspended
 
 
-def test_a_silent_client_delays_others_only_for_a_short_time(
-    fixture: Fixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_silent_client_delays_others_only_for_a_short_time(fixture: Fixture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "TIMEOUT_S", 0.1)
     with socket.socket(socket.AF_UNIX) as silent, SocketAddress(fixture.folder) as address:
         silent.connect(address)

@@ -1,4 +1,4 @@
-"""The installation: atomic links, pruning, the lock, and what other installations are told."""
+"""The installation: atomic links, pruning, the lock, and the remedy for other installations."""
 
 import os
 from pathlib import Path
