@@ -96,8 +96,8 @@ def download(pin: Pin, target: Target, wheels: Path, own: Path | None) -> bool:
     Raises:
         BundleError: There is neither.
     """
-    if own is not None and (file := _own_wheel(pin, target, own)) is not None:
-        shutil.copy(file, wheels)
+    if own is not None and (built := _own_wheel(pin, target, own)) is not None:
+        shutil.copy(built, wheels)
         return False
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as file:
         file.write(f"{pin.name}=={pin.version} {' '.join(f'--hash={each}' for each in pin.hashes)}\n")

@@ -62,7 +62,7 @@ def test_an_agent_that_ends_for_an_update_is_started_again_by_the_launcher(make_
     assert (service["Restart"], service["Type"]) == ("always", "notify")
     assert parser["Unit"]["StartLimitIntervalSec"] == "0", "three failed starts must not end the restarts"
     assert float(service["TimeoutStartSec"]) > TRIAL_S, "the agent itself reports a failed check"
-    assert "@" not in unit.read_text()
+    assert not re.search(r"@[A-Z]+@", unit.read_text())
     if user:
         assert (service["User"], service["ReadWritePaths"]) == (user, f"{unit.parent}/home")
 
