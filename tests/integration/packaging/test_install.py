@@ -123,8 +123,9 @@ def test_an_interrupted_installation_is_repeated_and_a_wrong_hash_leaves_the_rel
     agent: InstalledAgent, wheel: Path, tmp_path: Path
 ) -> None:
     first = bundle(tmp_path, wheel, "0.1.0")
-    command = ["sh", SCRIPT, "--prefix", agent.prefix, "--home", agent.home, "--user", "root", "--no-service"]
-    killed = subprocess.Popen([*command, "--python", sys.executable, "--bundle", first], start_new_session=True)
+    command = ["sh", str(SCRIPT), "--prefix", str(agent.prefix), "--home", str(agent.home), "--user", "root"]
+    command += ["--no-service"]
+    killed = subprocess.Popen([*command, "--python", sys.executable, "--bundle", str(first)], start_new_session=True)
     while not (agent.prefix / "releases/0.1.0/bin").exists():
         time.sleep(0.05)
         assert killed.poll() is None

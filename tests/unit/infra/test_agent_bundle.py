@@ -73,7 +73,8 @@ def test_lists_name_every_file_and_build_tools_are_not_installed(tmp_path: Path)
         contents = {
             member.name.partition("/")[2]: file.read() for member in archive if (file := archive.extractfile(member))
         }
-    sums = dict(reversed(line.split("  ")) for line in contents.pop("SHA256SUMS").decode().splitlines())
+    lines = contents.pop("SHA256SUMS").decode().splitlines()
+    sums = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
     assert sums == {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     pins = contents["requirements.txt"].decode().splitlines()
     digest = hashlib.sha256(b"ruckig-0.19.4.tar.gz").hexdigest()

@@ -44,7 +44,7 @@ def make_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> MakeUnit:
 @pytest.mark.parametrize(("user", "options"), [("root", []), ("", ["--user"])])
 def test_systemd_accepts_the_unit(make_unit: MakeUnit, user: str, options: list[str]) -> None:
     unit = make_unit(user)
-    command = ["systemd-analyze", *options, "verify", unit]
+    command = ["systemd-analyze", *options, "verify", str(unit)]
     environment = os.environ | {"XDG_RUNTIME_DIR": str(unit.parent)}
     result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stderr) == (0, ""), result

@@ -105,7 +105,8 @@ def test_a_failed_release_is_replaced_by_the_former_one(stub: StubInstallation, 
 def test_a_permission_that_expired_during_the_switch_undoes_it(
     stub: StubInstallation, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    link, expired = stub.installation.link, []
+    link = stub.installation.link
+    expired: list[str] = []
 
     def slow(name: str, version: str) -> None:
         link(name, version)

@@ -125,11 +125,12 @@ def test_a_journal_that_cannot_be_written_prevents_it(harness: DeviceHarness, mo
 
 
 def test_an_agent_is_suspended_only_with_all_its_devices(fixture: AgentFixture) -> None:
-    assert fixture.agent.linked
+    linked = [fixture.agent.linked]
     running = fixture.harness.running(fixture.harness.script("wait(600)"), epoch=1)
     assert fixture.agent.suspend(WHY) == "arm: an action runs"
     fixture.link.link_changed(False)
-    assert not fixture.agent.linked
+    linked.append(fixture.agent.linked)
+    assert linked == [True, False]
     assert fixture.harness.end_code(running) == "link_lost"
     eventually(lambda: fixture.agent.suspend(WHY) == "")
     fixture.link.link_changed(True)
