@@ -249,8 +249,8 @@ write_unit() {
 uninstall() {
     [ -f "$PREFIX/installation" ] || fail "$PREFIX contains no agent"
     AGENT_HOME=$(sed -n 's/^home=//p' "$PREFIX/installation")
-    if [ -x "$PREFIX/bin/telescope-agent" ] &&
-        "$PREFIX/bin/telescope-agent" release 2>/dev/null | grep -q '^running *[0-9]'; then
+    state=$("$PREFIX/bin/telescope-agent" release 2>/dev/null || true) # empty if the installation is incomplete
+    if [ -n "$state" ] && ! echo "$state" | grep -q '^running *no$'; then
         fail "the agent runs; stop its service first (systemctl disable --now telescope-agent)"
     fi
     if [ -n "$DRY_RUN" ]; then
