@@ -81,18 +81,18 @@ def _update_in_motion(processes: CloudProcesses, agent: InstalledAgent, device: 
     action = start(processes, device, LONG, until="started")
     assert action["status"] == "started", action
     running = agent.pid
-    update = agent.begin("update", "--bundle", str(new))
-    assert update.stdout is not None
     output = ""
-    while "waiting: arm: " not in output:
-        line = update.stdout.readline()
-        assert line, output
-        output += line
-    moving = processes.anna.get(f"/actions/{action['id']}").json()
-    assert (moving["status"], agent.pid, agent.starts) == ("started", running, 1), output
-    assert processes.anna.post(f"/actions/{action['id']}/cancel").status_code < 300
-    output += update.stdout.read()
-    assert update.wait() == 0, output
+    with agent.begin("update", "--bundle", str(new)) as update:
+        assert update.stdout is not None
+        while "waiting: arm: " not in output:
+            line = update.stdout.readline()
+            assert line, output
+            output += line
+        moving = processes.anna.get(f"/actions/{action['id']}").json()
+        assert (moving["status"], agent.pid, agent.starts) == ("started", running, 1), output
+        assert processes.anna.post(f"/actions/{action['id']}/cancel").status_code < 300
+        output += update.stdout.read()
+    assert update.returncode == 0, output
     ended = processes.anna.get(f"/actions/{action['id']}").json()
     assert ended["status"] == "cancelled", "no restart ended the motion"
     assert 0.001 < ended["result"]["position_rad"]["shoulder_pan"] < 2.0
