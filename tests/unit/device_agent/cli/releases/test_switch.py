@@ -168,7 +168,8 @@ with installation.lock():
 """An updater that kills itself before a change of the installation, or before a message to the agent."""
 
 
-@pytest.mark.parametrize("result", ["passed", "failed it does not work"])
+@pytest.mark.slow
+@pytest.mark.parametrize("result", ["passed", pytest.param("failed it does not work", marks=pytest.mark.long)])
 def test_an_updater_killed_at_any_step_leaves_a_release_that_works(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, result: str
 ) -> None:
