@@ -27,7 +27,7 @@ BROWSERS = -n 2 --dist loadscope tests/e2e
 SERIAL = tests/api tests/faults tests/security/tenants/test_secrets.py
 
 .PHONY: docs help up link env console test test-fast test-long bench bench-quick soak coverage fuzz mutation check check-python check-web audit-packages contract requirements \
-	system-packages test-environment wheels clean
+	system-packages test-environment wheels agent-bundle clean
 .DELETE_ON_ERROR:
 
 help:
@@ -44,6 +44,7 @@ help:
 	@echo "make fuzz            run each parser under a fuzzer for SECONDS_EACH (60) seconds"
 	@echo "make mutation        test mutants of authority, control, actions and delivery; writes docs/results/mutation.md"
 	@echo "make wheels          build the distributions telescope-agent and telescope-server into dist/"
+	@echo "make agent-bundle    build the offline bundle of the agent for PLATFORM (linux_x86_64, linux_aarch64) and PYTHON_VERSION (3.11)"
 	@echo "make contract        regenerate the AsyncAPI document, the script API and the console's message types"
 	@echo "make requirements    regenerate requirements.txt and requirements/*.txt"
 	@echo "make audit-packages  query osv.dev for advisories against the pinned packages (needs a network)"
@@ -208,6 +209,12 @@ contract: .venv/.dev web/node_modules/.installed
 wheels: .venv/.dev console
 	@$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir dist . ./infra/packaging/telescope-agent
 	@ls dist/*.whl
+
+# Machine and Python version of the robot.
+PLATFORM ?= linux_x86_64
+PYTHON_VERSION ?= 3.11
+agent-bundle: .venv/.dev
+	@nice $(BIN)/python infra/packaging/bundle.py --platform $(PLATFORM) --python $(PYTHON_VERSION) $(if $(WHEELS),--wheels $(WHEELS))
 
 # Separate from `check`, which needs no network. It fails when the database cannot be reached.
 audit-packages: .venv/.dev

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from device_agent.cli import devices, doctor, enroll, load_test, models, new_driver, run
+from device_agent.cli.releases import commands as releases
 from device_agent.config.errors import ConfigError
+from device_agent.config.release import VERSION
 from device_agent.load_generator.options import LoadTestError
 from device_agent.ports.driver import DriverError
 from device_agent.ports.geometry import GeometryError
@@ -20,7 +22,7 @@ _ERRORS = (
     ConfigError, JournalError, DriverError, GeometryError, TransportError, CloudError, LoadTestError, OSError,
 )  # fmt: skip
 """Errors that are shown in one line."""
-_COMMANDS = (enroll, run, doctor, devices, models, new_driver, load_test)
+_COMMANDS = (enroll, run, doctor, devices, releases, models, new_driver, load_test)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -44,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m device_agent", description="The Telescope agent of a robot.")
+    parser.add_argument("--version", action="version", version=f"telescope-agent {VERSION}")
     log_output.add_arguments(parser, os.environ)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     home = Path(os.environ.get("TELESCOPE_AGENT_HOME", Path.home() / ".telescope-agent"))

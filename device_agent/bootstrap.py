@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 class RunningAgent:
     """An agent and the resources to close with it. While it runs, the caller must check its ``supervisor``."""
 
-    _agent: Agent
+    agent: Agent
     _journal: Journal
     _monitor: PairingMonitor
     _sandbox: Sandbox
@@ -72,13 +72,13 @@ class RunningAgent:
             TransportError: The configuration of the transport is unusable.
         """
         self._sandbox.start()
-        self._agent.start()
+        self.agent.start()
         self.supervisor.start()
 
     def stop(self) -> None:
         """Hold, disconnect and close. May be called repeatedly."""
         self.supervisor.stop()
-        self._agent.stop()
+        self.agent.stop()
         self._sandbox.close()
         self._journal.close()
 

@@ -13,7 +13,8 @@ ROOT = Path(__file__).resolve().parent.parent
 EXPORTS = {
     "requirements.txt": ("functions", "azure"),
     "requirements/aws.txt": ("functions", "aws"),
-    "requirements/agent.txt": ("agent", "sim", "xmpp"),
+    "requirements/agent.txt": ("agent", "sim", "xmpp", "ros"),
+    "requirements/agent-build.txt": ("agent-build",),
     "requirements/local.txt": ("local",),
     "requirements/naoqi.txt": ("naoqi",),
     "requirements/node.txt": ("node",),

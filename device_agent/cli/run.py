@@ -8,7 +8,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,11 +17,15 @@ from device_agent import bootstrap
 from device_agent.cli import robot_types, systemd
 from device_agent.cli.arguments import Commands, add_home, add_no_qr
 from device_agent.cli.enroll import announce, await_claim
+from device_agent.cli.local_control.server import ControlServer
+from device_agent.cli.releases.trial import PASSED, SUSPENDED, Trial
 from device_agent.config.agent_config import AgentConfig
 from device_agent.config.errors import ConfigError
 from device_agent.config.identity_store import IdentityStore
+from device_agent.config.release import VERSION
 from device_agent.ports.clock import CloudClock
 from device_agent.ports.tracing import CommandTraces, NoTraces
+from device_agent.runtime.restart_permission import RestartPermission
 from device_agent.runtime.supervision import CHECK_PERIOD_S
 
 if TYPE_CHECKING:
@@ -53,14 +58,19 @@ def add_commands(commands: Commands, home: Path) -> None:
 def _run(options: argparse.Namespace) -> int:
     store = IdentityStore(options.home)
     with store.lock():
+        trial = Trial.of(store.folder, os.environ)
+        if trial is not None:
+            trial.start()
         if store.pairing() is None:
+            if trial is not None:
+                trial.finish(PASSED)  # without a pairing there is nothing else to prove
             _pair(store, qr=not options.no_qr)
         if options.trace is not None:
             options.trace.mkdir(parents=True, exist_ok=True)
         robot_types.update(store)
         metrics = None if options.metrics is None else _serve_metrics(options.metrics)
         traces = _export_traces(os.environ)
-        while (code := _run_until_unpaired(store, options.trace, metrics, traces)) is None:
+        while (code := _run_until_unpaired(store, options.trace, metrics, traces, trial)) is None:
             _pair(store, qr=not options.no_qr)
             robot_types.update(store)
         traces.close()
@@ -75,6 +85,13 @@ def _pair(store: IdentityStore, *, qr: bool) -> None:
     config = AgentConfig.load(store.folder)
     systemd.ready("waiting to be claimed")
     previous = signal.signal(signal.SIGTERM, _exit)
+    control = ControlServer(
+        store.folder,
+        RestartPermission(_NoDevices()),
+        linked=lambda: False,
+        restart=lambda: os.kill(os.getpid(), signal.SIGTERM),
+    )
+    control.start()
     try:
         while True:
             api = bootstrap.cloud_client(store, config, CloudClock())
@@ -86,7 +103,18 @@ def _pair(store: IdentityStore, *, qr: bool) -> None:
             else:
                 return
     finally:
+        control.stop()
         signal.signal(signal.SIGTERM, previous)
+
+
+class _NoDevices:
+    """An agent that waits to be claimed: nothing can move."""
+
+    def suspend(self, _why: str) -> str:
+        return ""
+
+    def resume(self) -> None:
+        return
 
 
 def _exit(*_: object) -> None:
@@ -123,13 +151,18 @@ def _export_traces(environment: Mapping[str, str]) -> CommandTraces:
 
 
 def _run_until_unpaired(
-    store: IdentityStore, trace: Path | None, metrics: "AgentMetrics | None", traces: CommandTraces
+    store: IdentityStore, trace: Path | None, metrics: "AgentMetrics | None", traces: CommandTraces, trial: Trial | None
 ) -> int | None:
     """Run with the saved pairing. Returns the exit code, or ``None`` if the pairing is no longer valid."""
     stop = threading.Event()
     previous = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     agent = bootstrap.build(store, trace=trace, metrics=metrics, traces=traces)
+    permission = RestartPermission(agent.agent)
+    control = ControlServer(store.folder, permission, linked=lambda: agent.agent.linked, restart=stop.set)
     try:
+        on_trial = trial is not None and not trial.over
+        if on_trial:
+            agent.agent.suspend(SUSPENDED)
         if renderer := bootstrap.renderer_name(AgentConfig.load(store.folder)):
             print(f"renderer {renderer}", flush=True)
         agent.start()
@@ -137,16 +170,30 @@ def _run_until_unpaired(
         print("running", flush=True)
         systemd.ready("running")
         systemd.set_watchdog(_WATCHDOG_S)
+        if trial is not None and on_trial:
+            return _supervise(agent, stop, partial(_check_trial, trial, agent, control))
+        control.start()
         return _supervise(agent, stop)
     finally:
         systemd.set_watchdog(_STARTING_WATCHDOG_S)
         agent.stop()
+        control.stop()
         for number, handler in previous.items():
             signal.signal(number, handler)
 
 
-def _supervise(agent: bootstrap.RunningAgent, stop: threading.Event) -> int | None:
-    """Check the agent's threads until it ends; see ``_run_until_unpaired``."""
+def _check_trial(trial: Trial, agent: bootstrap.RunningAgent, control: ControlServer) -> None:
+    """Allow motion, and restarts, once a new release has proved that it works."""
+    if trial.check(healthy=agent.supervisor.healthy, linked=agent.agent.linked, now_s=time.monotonic()):
+        agent.agent.resume()
+        control.start()
+        print(f"release {VERSION} has passed its check", flush=True)
+
+
+def _supervise(
+    agent: bootstrap.RunningAgent, stop: threading.Event, on_check: Callable[[], None] = lambda: None
+) -> int | None:
+    """Check the agent's threads until it ends; see ``_run_until_unpaired``. ``on_check`` runs after each check."""
     notified_s = 0.0
     while not stop.wait(CHECK_PERIOD_S):
         if reason := agent.supervisor.check():
@@ -156,6 +203,7 @@ def _supervise(agent: bootstrap.RunningAgent, stop: threading.Event) -> int | No
         if agent.supervisor.healthy and time.monotonic() - notified_s >= _NOTIFY_S:
             notified_s = time.monotonic()
             systemd.notify_watchdog()
+        on_check()
         if agent.outdated:
             return None
     return 0

@@ -26,7 +26,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from msgspec import Struct
 
-from device_agent.config import private_file
+from device_agent.config import private_file, release
 from device_agent.config.errors import ConfigError
 from device_agent.protocol import Id
 from device_agent.protocol.errors import ProtocolError
@@ -49,6 +49,7 @@ class Pairing(Struct, frozen=True, kw_only=True):
         owner: Account id of the owner. Scripts of other accounts are untrusted.
         serial: Serial number of the newest key; it never decreases.
         until_ms: Expiry of superseded keys: key id → the cloud's clock [ms].
+        format: Format of the file; see ``release.PAIRING_FORMAT``.
     """
 
     agent: Id
@@ -58,6 +59,7 @@ class Pairing(Struct, frozen=True, kw_only=True):
     owner: str = ""
     serial: Serial = 1
     until_ms: dict[str, Milliseconds] = {}
+    format: int = release.WRITTEN["pairing.json"]
 
     def public_keys(self) -> dict[str, Ed25519PublicKey]:
         """The pinned keys, parsed."""
@@ -135,7 +137,10 @@ class IdentityStore:
         """
         path = self._pairing
         try:
-            pairing = msgspec.json.decode(path.read_bytes(), type=Pairing)
+            content = path.read_bytes()
+            if release.pairing_format(content) > release.PAIRING_FORMAT:
+                raise ConfigError(f"{path} was written by a newer release; use that release")
+            pairing = msgspec.json.decode(content, type=Pairing)
             pairing.public_keys()
         except FileNotFoundError:
             return None

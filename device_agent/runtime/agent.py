@@ -14,7 +14,11 @@ _log = logging.getLogger(__name__)
 
 
 class Agent:
-    """Connects devices to a transport."""
+    """Connects devices to a transport.
+
+    Attributes:
+        linked: Whether the link is up.
+    """
 
     def __init__(
         self,
@@ -30,6 +34,7 @@ class Agent:
         self._outbox = outbox
         self._readings = readings
         self._address = address
+        self.linked = False
 
     def start(self) -> None:
         """Start every device, then the link: a device holds before it can receive messages.
@@ -55,6 +60,19 @@ class Agent:
         """Whether no device moves or runs an action, so that a short interruption of the link is harmless."""
         return all(device.quiet for device in self._devices.values())
 
+    def suspend(self, why: str) -> str:
+        """Reject all motion at every device until ``resume``. Returns what prevents it, or an empty string."""
+        for device in self._devices.values():
+            if reason := device.suspend(why):
+                self.resume()
+                return f"{device.name}: {reason}"
+        return ""
+
+    def resume(self) -> None:
+        """Allow motion again."""
+        for device in self._devices.values():
+            device.resume()
+
     def _receive(self, topic: str, payload: bytes) -> None:
         try:
             parsed = topics.parse(topic)
@@ -70,6 +88,7 @@ class Agent:
 
     def _link_changed(self, up: bool) -> None:
         _log.info("link %s", "up" if up else "lost")
+        self.linked = up
         self._outbox.link_changed(up)
         for device in self._devices.values():
             device.link_changed(up)

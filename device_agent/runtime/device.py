@@ -44,7 +44,7 @@ from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.runtime.room.sensor_loop import SENSOR_LOOP, SensorLoop
-from device_agent.runtime.storage.journal import Journal
+from device_agent.runtime.storage.journal import Journal, JournalError
 from device_agent.runtime.supervision import Failure, PartFaults, Supervisor
 from device_agent.runtime.telemetry.camera_streamer import CameraStreamer
 from device_agent.runtime.telemetry.device_publisher import DevicePublisher
@@ -58,6 +58,8 @@ _REJECTED = {
 }
 _SCRIPTS = {"unavailable": EventKind.SCRIPTS_UNAVAILABLE, "unconfined": EventKind.SCRIPTS_UNCONFINED}
 MAX_REASON = 2000
+_REST_RAD_S = 0.05
+"""A joint that is measured below this speed is at rest; above the noise of encoders [rad/s]."""
 _log = logging.getLogger(__name__)
 
 
@@ -92,6 +94,7 @@ class Device:
         streaming: bool = True,
     ) -> None:
         self.name = name
+        self._sync = journal.sync
         self._load = load or LoadGovernor()
         self._driver = driver
         self._sandbox = sandbox
@@ -274,6 +277,38 @@ class Device:
     def quiet(self) -> bool:
         """Whether the device neither moves nor runs an action."""
         return not self._controller.moving and self._executor.current() is None
+
+    def suspend(self, why: str) -> str:
+        """Reject grants, actions and motion with the reason ``why`` until ``resume``; Stop still latches.
+
+        Returns:
+            What prevents it, or an empty string: no lease is in force, nothing moves and the journal is on disk.
+        """
+        reason = self._controller.suspend(why, time.monotonic())
+        if reason:
+            return reason
+        try:
+            self._sync()
+        except JournalError as error:
+            reason = str(error)
+        if not self._executor.idle:
+            reason = "an action ends"
+        elif self._moves():
+            reason = "a joint moves"
+        if reason:
+            self._controller.resume()
+        return reason
+
+    def resume(self) -> None:
+        """Allow grants, actions and motion again."""
+        self._controller.resume()
+
+    def _moves(self) -> bool:
+        """Whether the device is measured in motion. The last measurement of a failed device is no evidence."""
+        observation = self._loop.observation
+        if observation is None or self._controller.fault is not None:
+            return False
+        return any(abs(velocity) > _REST_RAD_S for velocity in observation.velocity_rad_s)
 
     def _publish(self, stream: str, telemetry: JointTelemetry | Measurements) -> None:
         self._readings.record(self.name, stream, telemetry)

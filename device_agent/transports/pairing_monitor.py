@@ -7,6 +7,7 @@ from typing import Any
 
 from device_agent.config.agent_config import AgentConfig
 from device_agent.config.identity_store import Pairing
+from device_agent.config.release import VERSION
 from device_agent.protocol import topics
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.errors import Refused
@@ -14,7 +15,7 @@ from device_agent.transports.http import responses
 from device_agent.transports.http.client import CloudClient, CloudError
 
 _log = logging.getLogger(__name__)
-SOFTWARE = "telescope-agent 0.1.0"
+SOFTWARE = f"telescope-agent {VERSION}"
 
 
 def pairing_of(claimed: responses.Claimed) -> Pairing:

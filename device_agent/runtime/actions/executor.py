@@ -55,6 +55,7 @@ class ActionExecutor:
         self._report = report
         self._lock = threading.Lock()
         self._run: _Run | None = None
+        self._last: _Run | None = None
 
     def start(self, command: Command, request: ActionRequest) -> None:
         """Start the action of an accepted command. Its acks follow.
@@ -77,7 +78,7 @@ class ActionExecutor:
                 run.reserve(room_actions.create(request, self._context.room_device, run.add_output))
             else:
                 run.reserve(room_actions.OneShotAction(partial(run.robot.execute_task, request)))
-            self._run = run
+            self._run = self._last = run
         name, device = f"action-{command.id}", command.device
         SupervisedThread(partial(self._execute, run), name=name, part="action", device=device).start()
         run.report_started()
@@ -98,6 +99,12 @@ class ActionExecutor:
         """The running action."""
         with self._lock:
             return None if self._run is None else self._run.state()
+
+    @property
+    def idle(self) -> bool:
+        """Whether no action runs, and the end of the last one is in the journal."""
+        last = self._last
+        return last is None or last.over.is_set()
 
     def close(self) -> None:
         """End the running action because the agent shuts down."""
@@ -225,14 +232,16 @@ class _Run:
 
     def report_end(self) -> None:
         """Acknowledge the end."""
-        result = self._context.measured() | self._result
-        if self._ending is None:
-            self._report(self.command.id, AckStatus.DONE, output=self._output, progress=1.0, result=result)
-        else:
-            status, why = self._ending
-            reason = Reason(code=why.code, message=why.message[:MAX_OUTPUT])
-            self._report(self.command.id, status, reason=reason, output=self._output, result=result)
-        self.over.set()
+        try:
+            result = self._context.measured() | self._result
+            if self._ending is None:
+                self._report(self.command.id, AckStatus.DONE, output=self._output, progress=1.0, result=result)
+            else:
+                status, why = self._ending
+                reason = Reason(code=why.code, message=why.message[:MAX_OUTPUT])
+                self._report(self.command.id, status, reason=reason, output=self._output, result=result)
+        finally:
+            self.over.set()
 
     def state(self) -> ActionState:
         """The action as the device's ``state`` contains it."""

@@ -43,6 +43,7 @@ class Authority:
         device_stopped: Whether ``fault`` is a stop of the device itself, which prevents the reset of Stop.
         reservation: Reservation of the running action.
         restrictions: Speed restrictions of the room.
+        suspended: Why nothing may move and no lease is granted until it is empty again; see ``Device.suspend``.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Authority:
         self.device_stopped = False
         self.reservation: Reservation | None = None
         self.restrictions = Restrictions()
+        self.suspended = ""
 
     @property
     def epochs(self) -> tuple[int, int]:
@@ -82,6 +84,7 @@ class Authority:
         self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "", keys: SetpointKeys = ()
     ) -> bool:
         """See ``Controller.grant``. Returns True if the epoch is new and the previous holder lost control."""
+        self._check_not_suspended()
         before, previous = self._gate.epoch, self._gate.granted
         self._gate.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason, keys=keys)
         new = self._superseded(before, previous, f"{holder} took control")
@@ -190,8 +193,9 @@ class Authority:
         """Check that nothing prevents motion.
 
         Raises:
-            Refused: Stopped, faulty, or held by the room.
+            Refused: Suspended, stopped, faulty, or held by the room.
         """
+        self._check_not_suspended()
         if self.latch is not None:
             raise Refused("stopped", f"stopped by {self.latch.caller}; reset Stop first")
         if self.fault is not None:
@@ -199,6 +203,10 @@ class Authority:
         strictest = self.restrictions.strictest
         if strictest is not None and strictest.speed <= 0:
             raise Refused("interlock", f"the room holds the device: {strictest.why}")
+
+    def _check_not_suspended(self) -> None:
+        if self.suspended:
+            raise Refused("restarting", self.suspended)
 
     def check_reservation(self, reservation: Reservation) -> None:
         """Check that this reservation is in force.

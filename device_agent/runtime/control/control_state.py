@@ -81,6 +81,18 @@ class ControlState:
         self.handed_over = False
         self.stream.hold_here(self.motion.position_rad)
 
+    def suspend(self, why: str, now_s: float) -> str:
+        """See ``Controller.suspend``."""
+        lease = self.authority.lease(now_s)
+        if lease is not None:
+            return f"{lease.holder} has control"
+        if self.authority.reservation is not None:
+            return "an action runs"
+        if self.goals.moving:
+            return "it moves"
+        self.authority.suspended = why
+        return ""
+
     def _hold(self, why: Refused) -> None:
         """Bring the device to rest after the right to move has ended."""
         self.stream.clear()

@@ -33,8 +33,7 @@ class Controller:
         gate: Lease gate with the epochs of the previous run.
         latch: Stop latch of the previous run.
         geometry: Shape of the robot; without it, clearance is not checked.
-        record: Receives an event for each change of authority, with the controller locked: it must not block or call
-            the controller.
+        record: Receives each change of authority with the controller locked; must not block or call the controller.
 
     Attributes:
         changed: Set when epochs or latch changed and must be journalled; the command processor clears it.
@@ -178,7 +177,7 @@ class Controller:
                 self._state.authority.check_free()
             reservation = self._state.authority.reserve(epoch, on_revoked)
             self._state.stream.clear()
-            return reservation
+        return reservation
 
     def end_reservation(self, reservation: Reservation) -> None:
         """End the reservation of an action, and brake its motion."""
@@ -273,6 +272,16 @@ class Controller:
             if reservation is not None:
                 self._check_goal(reservation)
             self._state.stiffness.set(values)
+
+    def suspend(self, why: str, now_s: float) -> str:
+        """Reject grants and motion until ``resume``. Returns what prevents it, or an empty string."""
+        with self._lock:
+            return self._state.suspend(why, now_s)
+
+    def resume(self) -> None:
+        """Allow grants and motion again after ``suspend``."""
+        with self._lock:
+            self._state.authority.suspended = ""
 
     # ------------------------------------------------------------ state
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from device_agent.config.release import JOURNAL_FORMAT
 from device_agent.protocol import Ack, AckStatus, Reason, StopLatch, codec
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.state import unverified
@@ -75,6 +76,7 @@ class Journal:
             self._database.execute("PRAGMA journal_mode=WAL")
             self._database.execute("PRAGMA synchronous=NORMAL")
             self._database.execute(f"PRAGMA cache_size=-{_CACHE_KB}")
+            self._check_format(self._database)
             self._database.executescript(_SCHEMA)
             self._database.execute(
                 "DELETE FROM commands WHERE terminal = 1 AND at_ms < min(?, (SELECT max(at_ms) FROM commands)) - ?",
@@ -85,6 +87,17 @@ class Journal:
                 f"the journal {self._path} cannot be used ({error}). Move it away to start with an empty one; the "
                 "agent then needs a new lease for each device and will not know which commands it has already run."
             ) from error
+
+    def _check_format(self, database: sqlite3.Connection) -> None:
+        found = database.execute("PRAGMA user_version").fetchone()[0]
+        if found > JOURNAL_FORMAT:
+            self.close()
+            raise JournalError(
+                f"the journal {self._path} has format {found}, and this release reads up to {JOURNAL_FORMAT}: a newer "
+                "release wrote it. Use that release; do not delete the journal"
+            )
+        if found < JOURNAL_FORMAT:
+            database.execute(f"PRAGMA user_version={JOURNAL_FORMAT}")
 
     def close(self) -> None:
         """Close the file. May be called twice."""

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from device_agent.config.release import OUTBOX_FORMAT
+
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS items (
     id INTEGER PRIMARY KEY AUTOINCREMENT, late INTEGER NOT NULL, at_ms INTEGER NOT NULL,
@@ -93,6 +95,11 @@ class OutboxStore:
         self._database = sqlite3.connect(self._path, check_same_thread=False, isolation_level=None)
         self._database.execute("PRAGMA journal_mode=WAL")
         self._database.execute("PRAGMA synchronous=NORMAL")
+        found = self._database.execute("PRAGMA user_version").fetchone()[0]
+        if found > OUTBOX_FORMAT:
+            self.close()
+            raise OutboxStoreError(f"{self._path} has format {found}: a newer release wrote it; use that release")
+        self._database.execute(f"PRAGMA user_version={OUTBOX_FORMAT}")
         self._database.executescript(_SCHEMA)
         for table, column in (("items", "topic"), ("dropped", "device")):
             self._database.execute(

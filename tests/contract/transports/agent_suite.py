@@ -67,7 +67,7 @@ class PairedAgent:
 
     def start(self) -> None:
         self.cell = bootstrap.build(self.store)
-        agent: Any = self.cell._agent
+        agent: Any = self.cell.agent
         self.device: Any = agent._devices["arm"]
         driver: Any = self.device._driver
         controller: Any = self.device._controller

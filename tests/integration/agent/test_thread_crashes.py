@@ -63,7 +63,7 @@ class MovingAgent(AgentProcess):
         self.failures: list[Failure] = []
         self.agent = bootstrap.build(self.store)
         self.agent.supervisor.add(self)
-        self.device = self.agent._agent._devices[DEVICE]
+        self.device = self.agent.agent._devices[DEVICE]
         self.driver = cast("Any", self.device._driver)
         self.world = self.driver._world
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from device_agent.config import release
 from device_agent.config.agent_config import AgentConfig, DeviceEntry
 from device_agent.config.errors import ConfigError
 from device_agent.config.identity_store import IdentityStore, Pairing
@@ -107,3 +108,10 @@ def test_key_readable_by_others_is_made_private_with_a_warning(
     caplog.clear()
     store.private_key()
     assert caplog.text == ""
+
+
+def test_a_pairing_of_a_newer_release_is_not_read_and_not_declared_damaged(store: IdentityStore) -> None:
+    store.save_pairing(Pairing(agent="a", space="s", account="ann", keys={}, format=release.PAIRING_FORMAT + 1))
+    with pytest.raises(ConfigError, match="newer release; use that release"):
+        store.pairing()
+    assert release.present_formats(store.folder) == {"pairing.json": release.PAIRING_FORMAT + 1}

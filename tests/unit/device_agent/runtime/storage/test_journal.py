@@ -2,13 +2,16 @@
 
 import errno
 import os
+import sqlite3
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
 import pytest
 
+from device_agent.config.release import JOURNAL_FORMAT
 from device_agent.protocol import Ack, AckStatus, Reason, StopLatch
 from device_agent.runtime.storage.journal import Journal, JournalError
 from tests.fakes.tracing import TRACEPARENT
@@ -274,3 +277,15 @@ def test_an_ended_command_of_a_previous_run_has_its_time_and_is_undelivered(open
     assert ended.traceparent == TRACEPARENT
     assert (ended.id, ended.status, ended.sequence, ended.at_ms, ended.tick_ms) == ("c1", AckStatus.FAILED, 2, 7, 8)
     assert after.end_open(now_ms=9, tick_ms=9) == 0
+
+
+def test_a_journal_of_a_newer_format_is_not_opened_and_not_changed(tmp_path: Path, open_journal: OpenJournal) -> None:
+    open_journal().close()
+    path = tmp_path / "journal.db"
+    with closing(sqlite3.connect(path)) as database:
+        assert database.execute("PRAGMA user_version").fetchone() == (JOURNAL_FORMAT,)
+        database.execute(f"PRAGMA user_version={JOURNAL_FORMAT + 1}")
+    before = path.read_bytes()
+    with pytest.raises(JournalError, match="a newer release wrote it"):
+        Journal(path).open(now_ms=0)
+    assert path.read_bytes() == before

@@ -3,10 +3,12 @@
 import sqlite3
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+from device_agent.config.release import OUTBOX_FORMAT
 from device_agent.runtime.storage import outbox_store as module
 from device_agent.runtime.storage.outbox_store import DroppedCount, OutboxItem, OutboxStore, OutboxStoreError
 
@@ -238,3 +240,13 @@ def test_a_full_disk_changes_nothing_and_raises(tmp_path: Path, store: OutboxSto
         other.execute("DROP TABLE items")
     with pytest.raises(OutboxStoreError, match="cannot be read"):
         store.after(0, late=True, limit=1)
+
+
+def test_a_file_of_a_newer_format_is_neither_used_nor_moved_away(open_store: OpenStore, tmp_path: Path) -> None:
+    open_store().close()
+    with closing(sqlite3.connect(tmp_path / "outbox.db")) as database:
+        assert database.execute("PRAGMA user_version").fetchone() == (OUTBOX_FORMAT,)
+        database.execute(f"PRAGMA user_version={OUTBOX_FORMAT + 1}")
+    with pytest.raises(OutboxStoreError, match="a newer release wrote it"):
+        open_store()
+    assert not (tmp_path / "outbox.damaged").exists()
