@@ -23,11 +23,10 @@ import msgspec
 import paho.mqtt.client as mqtt
 from telescope_client import call, connect_to_broker, find_device, topic
 
-from device_agent.drivers.ros.connection import Connection, Subscription
-from device_agent.drivers.ros.joint_commands import Publication
-from device_agent.drivers.ros.messages import NS, Dialect, Time, Twist
-from device_agent.drivers.ros.rosbridge import RosbridgeChannel
-from device_agent.drivers.ros.rospy_channel import RospyChannel
+from device_agent.middleware.ros.connection import Connection, Publication, Subscription
+from device_agent.middleware.ros.messages import NS, Dialect, Time, Twist
+from device_agent.middleware.ros.rosbridge import RosbridgeChannel
+from device_agent.middleware.ros.rospy_channel import RospyChannel
 from device_agent.ports.driver import UnreachableError
 from device_agent.protocol.security import setpoints
 

@@ -14,13 +14,14 @@ OptionalTopic = Annotated[str, Meta(pattern=r"^([/~A-Za-z][A-Za-z0-9_/]*)?$", ma
 
 
 class Command(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where joint commands are published.
+    """Where joint commands of one controller are published.
 
     Attributes:
         topic: Topic; for ``goal`` the name of the action.
         kind: ``trajectory``: JointTrajectory. ``positions``: Float64MultiArray. ``joint_state``: JointState. ``goal``:
-            FollowJointTrajectory (ROS 1).
-        joints: ROS names of the joints in the controller's order; only for ``positions``, whose messages have no names.
+            FollowJointTrajectory.
+        joints: ROS names of the controller's joints. It is required for ``positions``, whose messages have no names,
+            in the controller's order, and if there are several controllers.
         horizon_ms: Duration of each trajectory [ms]. The arm comes to rest after this time without commands.
         rate_hz: Commands per second, at most one in each control period [Hz].
     """
@@ -79,7 +80,7 @@ class Options(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         simulated: Whether the robot is a simulation, for example Gazebo. Operators see it.
         joint_states: Topic of JointState.
         names: Joint of the robot type → name of the joint in ROS; only for those that differ.
-        command: Where joint commands are published.
+        command: Where joint commands are published: one controller, or several that have different joints.
         base: Topics of a mobile base.
         cameras: Camera of the robot type → topic of CompressedImage with JPEGs.
         battery: Topic of BatteryState; empty for none.
@@ -97,13 +98,18 @@ class Options(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     simulated: bool = False
     joint_states: Topic = "/joint_states"
     names: dict[str, str] = {}
-    command: Command
+    command: Command | Annotated[tuple[Command, ...], Meta(min_length=1, max_length=8)]
     base: Base | None = None
     cameras: dict[str, Topic] = {}
     battery: OptionalTopic = ""
     diagnostics: OptionalTopic = ""
     stopping_diagnostics: tuple[str, ...] = ()
     safety: Annotated[tuple[Safety, ...], Meta(max_length=8)] = ()
+
+    @property
+    def controllers(self) -> tuple[Command, ...]:
+        """The controllers of the joints."""
+        return (self.command,) if isinstance(self.command, Command) else self.command
 
 
 def parse(options: Mapping[str, object], robot_type: RobotType) -> Options:
@@ -137,24 +143,34 @@ def _check(options: Options, robot_type: RobotType) -> None:
     names = [options.names.get(joint, joint) for joint in joints]
     if len(set(names)) != len(names):
         raise DriverError("option 'names': two joints have the same name in ROS")
-    _check_command(options, robot_type, names)
+    _check_joints(options.controllers, names)
+    for command in options.controllers:
+        _check_rate(command, robot_type)
     if options.connection == "rospy" and options.ros != 1:
         raise DriverError("option 'connection': use \"rosbridge\" with ROS 2")
     if (options.base is None) != (robot_type.base is None):
         raise DriverError(f"option 'base' is for robot types with a base; '{robot_type.type}' and the options differ")
 
 
-def _check_command(options: Options, robot_type: RobotType, names: Sequence[str]) -> None:
-    command = options.command
-    if command.kind == "positions":
-        if sorted(command.joints) != sorted(names):
+def _check_joints(controllers: Sequence[Command], names: Sequence[str]) -> None:
+    for command in controllers:
+        if not command.joints and (command.kind == "positions" or len(controllers) > 1):
             raise DriverError(
-                f"option 'command.joints' must list the joints in the controller's order: {', '.join(names)}"
+                f"option 'command.joints' must list the joints of {command.topic} in the controller's order; "
+                f"joints: {', '.join(names)}"
             )
-    elif command.joints:
-        raise DriverError("option 'command.joints' is only for kind = \"positions\"; other messages contain the names")
-    if command.kind == "goal" and options.ros != 1:
-        raise DriverError("option 'command.kind': use \"trajectory\" with ROS 2; its controllers take it on a topic")
+    listed = [name for command in controllers for name in command.joints or names]
+    if sorted(listed) != sorted(names):
+        wrong = sorted({name for name in names if listed.count(name) != 1} | (set(listed) - set(names)))
+        raise DriverError(
+            f"option 'command.joints': each joint must be listed once, by its name in ROS; check {', '.join(wrong)}"
+        )
+    topics = [command.topic.rstrip("/") for command in controllers]
+    if len(set(topics)) != len(topics):
+        raise DriverError("option 'command': two controllers have the same topic")
+
+
+def _check_rate(command: Command, robot_type: RobotType) -> None:
     if command.horizon_ms < 2 * max(robot_type.period_ms, 1000 / command.rate_hz):
         raise DriverError(
             "option 'command.horizon_ms' must be at least two command intervals: "

@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Mapping
 
-from device_agent.drivers.ros.messages import CompressedImage
+from device_agent.middleware.ros.messages import CompressedImage
 from device_agent.ports.driver import DriverError
 from device_agent.ports.sensor import Frame
 

@@ -6,9 +6,9 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from device_agent.drivers.ros import messages
 from device_agent.drivers.ros.options import Options, Safety
 from device_agent.drivers.ros.transforms import TransformTree
+from device_agent.middleware.ros import messages
 from device_agent.ports.driver import DriverFault
 
 _ERROR = 2

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from device_agent.drivers.ros import RosBaseDriver, RosDriver
-from device_agent.drivers.ros.joint_commands import Publication
 from device_agent.drivers.testing.peer import Disturbance
+from device_agent.middleware.ros.connection import Publication
 from device_agent.ports.driver import DriverError, Twist, UnreachableError
 from tests.harness.robots.ros import robot as topics
 from tests.harness.robots.ros.peer import RosPeer
