@@ -69,3 +69,10 @@ class TestActionGoals(TestRos1Arm):
     """An action server for FollowJointTrajectory."""
 
     kind = "goal"
+
+
+@pytest.mark.long
+class TestRos2ActionGoals(TestRos1Arm):
+    """An action server of ROS 2 for FollowJointTrajectory."""
+
+    ros, kind = 2, "goal"

@@ -162,11 +162,6 @@ def test_measurements_that_arrive_late_are_rejected(peer: RosPeer) -> None:
 @pytest.mark.parametrize("ros", [1, 2])
 def test_each_kind_of_command_moves_the_arm(kind: str, ros: int) -> None:
     peer = RosPeer(TYPE, ros=ros, kind=kind)
-    if (kind, ros) == ("goal", 2):
-        with pytest.raises(DriverError, match='use "trajectory" with ROS 2'):
-            create(peer)
-        peer.close()
-        return
     driver = create(peer)
     driver.connect()
     target = [value + 0.03 * (index + 1) for index, value in enumerate(HOME)]

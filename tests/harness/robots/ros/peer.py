@@ -35,7 +35,8 @@ class RosPeer:
         self._type, self._ros, self._kind, self._stamped = robot_type, ros, kind, stamped
         self._lock = threading.Lock()
         self.robot = Robot(robot_type, ros=ros, kind=kind, stamped=stamped)
-        self.server = RosbridgeServer(self.robot.types(), self._receive, ros)
+        self.server = RosbridgeServer(self.robot.types(), self._receive, ros, self._receive_goal)
+        self.server.actions[topics.ACTION] = "control_msgs/action/FollowJointTrajectory"
         self.server.latched[topics.SAFETY] = {"data": False}
         self._disturbance: Disturbance | None = None
         self._old_ns = 0
@@ -113,7 +114,7 @@ class RosPeer:
                 self.server.restart()
             self._disturbance = None
             if self.robot.stopped:
-                self.robot.stopped = False
+                self.robot.release()
                 self._publish_safety()
 
     def change(self, change: Callable[[Robot, RosbridgeServer], None]) -> None:
@@ -143,6 +144,12 @@ class RosPeer:
         except RejectedError as error:
             self.robot.rejected.append(str(error))
 
+    def _receive_goal(self, number: str, goal: Any) -> None:
+        if goal is None:
+            self.robot.action.cancel(number)
+        else:
+            self.robot.start_goal(number, goal)
+
     def _publish_safety(self) -> None:
         self.server.latched[topics.SAFETY] = {"data": self.robot.stopped}
         self.server.publish(topics.SAFETY, {"data": self.robot.stopped})
@@ -163,8 +170,14 @@ class RosPeer:
         if kind is Disturbance.NAN:
             message["position"] = [float("nan")] * len(message["position"])
         self.server.publish(topics.JOINT_STATES, message, self._corrupt)
+        for result in robot.results():
+            if self._ros == 1:
+                self.server.publish(f"{topics.ACTION}/result", result, self._corrupt)
+            else:
+                self.server.send_result(result)
         if self._cycles % _SLOW:
             return
+        self.server.publish(f"{topics.ACTION}/status", robot.status(), self._corrupt)
         self.server.publish(topics.DIAGNOSTICS, robot.diagnostics(), self._corrupt)
         self.server.publish(topics.BATTERY, robot.battery(), self._corrupt)
         self.server.publish(topics.ODOMETRY, robot.odometry(), self._corrupt)
