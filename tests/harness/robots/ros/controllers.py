@@ -142,6 +142,7 @@ class TrajectoryAction:
     Attributes:
         ended: Goals that have ended since the last look: goal, outcome, error code and text. An outcome is
             ``succeeded``, ``preempted``, ``aborted`` or ``rejected``.
+        newest: The goal that was accepted last.
         enabled: Whether the controller runs. Otherwise it rejects goals.
         silent: Whether it reports no results.
         cancelled: Number of goals that were cancelled.
@@ -151,6 +152,7 @@ class TrajectoryAction:
     def __init__(self, joints: JointController) -> None:
         self._joints = joints
         self._goal: Any = None
+        self.newest: Any = None
         self.enabled = True
         self.silent = False
         self.cancelled = self.succeeded = 0
@@ -168,7 +170,7 @@ class TrajectoryAction:
             return False
         if self._goal is not None:
             self._end(self._goal, "preempted", -1, "a new goal has arrived")
-        self._goal = goal
+        self._goal = self.newest = goal
         return True
 
     def cancel(self, goal: Any) -> None:
