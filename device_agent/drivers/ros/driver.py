@@ -1,6 +1,5 @@
 """Driver of a robot with ROS. ``device_agent/ports/driver.py`` documents each method."""
 
-import re
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -11,17 +10,18 @@ from device_agent.drivers.command_limits import limit_positions
 from device_agent.drivers.ros.goals import Goals
 from device_agent.drivers.ros.joint_commands import JointCommands
 from device_agent.drivers.ros.joint_states import JointStates, Measurement
-from device_agent.drivers.ros.options import Options
+from device_agent.drivers.ros.options import Options, RawCamera
 from device_agent.drivers.ros.pictures import Pictures
 from device_agent.drivers.ros.robot_status import RobotStatus
 from device_agent.middleware.ros import messages
-from device_agent.middleware.ros.connection import Channel, Command, Connection, Subscription
+from device_agent.middleware.ros.connection import Command, Connection, Subscription
+from device_agent.middleware.ros.images import RawImage
 from device_agent.middleware.ros.messages import Dialect
-from device_agent.middleware.ros.rosbridge import RosbridgeChannel
-from device_agent.middleware.ros.rospy_channel import RospyChannel
+from device_agent.middleware.ros.scans import LaserScan
 from device_agent.ports.driver import DriverError, DriverFault, Observation, UnreachableError
 from device_agent.ports.sensor import Frame
 from device_agent.protocol import Twin
+from device_agent.protocol.description import Stream
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.simulation.mjcf.robot_model import RobotModel
 
@@ -68,7 +68,7 @@ class RosDriver:
         self._states, self._status = self._new_states(), RobotStatus(self._options)
         self._commands = self._new_commands()
         connection = Connection(
-            self._open(),
+            self._options.open(self._device),
             subscriptions=self._subscriptions(self._states, self._status),
             advertised=self._advertised(),
             device=self._device,
@@ -119,7 +119,7 @@ class RosDriver:
         return applied
 
     def report(self, stream: str) -> Mapping[str, float | bool]:
-        """``health``: battery; ``odometry``: pose and velocity of the base."""
+        """``health``: battery; ``odometry``: pose and velocity of the base; others: ranges of a scan."""
         connection = self._connection
         return {} if connection is None or connection.lost else self._status.report(stream)
 
@@ -142,13 +142,6 @@ class RosDriver:
 
     # ------------------------------------------------------------ topics
 
-    def _open(self) -> Channel:
-        options = self._options
-        if options.connection == "rosbridge":
-            return RosbridgeChannel(options.address)
-        node = "telescope_" + re.sub(r"\W", "_", self._device)
-        return RospyChannel(python=options.python, folders=options.python_folders, master=options.master, node=node)
-
     def _subscriptions(self, states: JointStates, status: RobotStatus) -> list[Subscription]:
         options, subscriptions = self._options, []
 
@@ -159,12 +152,9 @@ class RosDriver:
         add(options.joint_states, "sensor_msgs/JointState", messages.JointState, states.accept)
         add(options.battery, "sensor_msgs/BatteryState", messages.BatteryState, status.accept_battery)
         add(options.diagnostics, "diagnostic_msgs/DiagnosticArray", messages.DiagnosticArray, status.accept_diagnostics)
-        for camera in self._type.cameras:
-            if camera.name in options.cameras:
-                kind = self._dialect.type("sensor_msgs/CompressedImage")
-                accept = partial(self._pictures.accept, camera.name)
-                topic, period_ms = options.cameras[camera.name], round(1000 / camera.rate_hz)
-                subscriptions.append(Subscription(topic, kind, messages.CompressedImage, accept, period_ms))
+        for stream, topic in options.scans.items():
+            add(topic, "sensor_msgs/LaserScan", LaserScan, partial(status.accept_scan, stream))
+        subscriptions += [self._camera(camera) for camera in self._type.cameras if camera.name in options.cameras]
         for safety in options.safety:
             add(safety.topic, safety.type, dict[str, Any], partial(status.accept_safety, safety))
         if options.base is not None:
@@ -174,6 +164,14 @@ class RosDriver:
                 static = partial(status.transforms.accept, static=True)
                 add("/tf_static", "tf2_msgs/TFMessage", messages.Transforms, static)
         return [*subscriptions, *(each for goals in self._goals for each in goals.subscriptions)]
+
+    def _camera(self, camera: Stream) -> Subscription:
+        source, period_ms = self._options.cameras[camera.name], round(1000 / camera.rate_hz)
+        if isinstance(source, RawCamera):
+            kind, accept_raw = self._dialect.type("sensor_msgs/Image"), partial(self._pictures.accept_raw, camera.name)
+            return Subscription(source.raw, kind, RawImage, accept_raw, period_ms)
+        kind, accept = self._dialect.type("sensor_msgs/CompressedImage"), partial(self._pictures.accept, camera.name)
+        return Subscription(source, kind, messages.CompressedImage, accept, period_ms)
 
     def _advertised(self) -> dict[str, str]:
         return {topic: kind for commands in self._commands for topic, kind in commands.advertised.items()}

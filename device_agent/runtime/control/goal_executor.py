@@ -114,12 +114,7 @@ class GoalExecutor:
             self.base.update(elapsed_s)
 
     def finish(
-        self,
-        limited: tuple[str, ...],
-        *,
-        measured_rad: Sequence[float] | None,
-        soft: Collection[int],
-        settled: bool,
+        self, limited: tuple[str, ...], *, measured_rad: Sequence[float] | None, soft: Collection[int], settled: bool
     ) -> None:
         """End the goal if it has been reached.
 

@@ -10,7 +10,7 @@ import simplejpeg
 
 from device_agent import drivers
 from device_agent.drivers.ros import RosBaseDriver, RosDriver
-from device_agent.drivers.ros.pictures import jpeg_size
+from device_agent.middleware.ros.images import jpeg_size
 from device_agent.drivers.testing.peer import Disturbance
 from device_agent.ports.driver import DriverError, Twist, UnreachableError
 from tests.harness.paths import UR5
