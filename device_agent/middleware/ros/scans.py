@@ -57,7 +57,9 @@ def beams(scan: LaserScan) -> tuple[Floats, Floats]:
     every = math.ceil(len(scan.ranges) / MAX_BEAMS)
     ranges_m: Floats = np.array([math.inf if each is None else each for each in scan.ranges[::every]], np.float64)
     valid = (ranges_m >= scan.range_min) & (ranges_m <= scan.range_max) & (ranges_m > 0)
-    angles_rad: Floats = scan.angle_min + np.arange(len(ranges_m)) * (every * scan.angle_increment)
+    angles_rad: Floats = np.asarray(
+        scan.angle_min + np.arange(len(ranges_m)) * (every * scan.angle_increment), np.float64
+    )
     ranges_m[~valid] = np.inf
     return angles_rad, ranges_m
 
@@ -80,7 +82,7 @@ def points(cloud: PointCloud2) -> Depths:
     if missing:
         raise ValueError(f"a PointCloud2 has no field '{missing[0]}' of type float32")
     used = [offsets[name] for name in "xyz"]
-    fits = 0 <= min(used) and max(used) + 4 <= cloud.point_step and cloud.width * cloud.point_step <= cloud.row_step
+    fits = min(used) >= 0 and max(used) + 4 <= cloud.point_step and cloud.width * cloud.point_step <= cloud.row_step
     if not fits or cloud.width < 1 or cloud.height < 1 or len(cloud.data) < cloud.height * cloud.row_step:
         raise ValueError(f"a PointCloud2 of {cloud.width} x {cloud.height} points has {len(cloud.data)} bytes")
     dtype, strides = np.dtype(">f4" if cloud.is_bigendian else "<f4"), (cloud.row_step, cloud.point_step)

@@ -16,12 +16,15 @@ from tests.harness.robots.ros.peer import RosPeer
 from tests.harness.robots.ros.ros_system import RosRobot, RosSystem, ros_system
 from tests.harness.robots.ros.rospy_peer import RospyPeer
 
+REST_S = 0.35
+"""A horizon, and the delay of the joints [s]."""
+
 
 class TestRos1Arm(DriverContract):
     """An arm with a trajectory controller."""
 
     type_name = "ur5"
-    ros, kind, stamped = 1, "trajectory", False
+    ros, kind, stamped, split = 1, "trajectory", False, False
 
     @pytest.fixture(autouse=True)
     def _short_start(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,7 +36,7 @@ class TestRos1Arm(DriverContract):
 
     @pytest.fixture
     def peer(self, robot_type: RobotType) -> Iterator[RosPeer]:
-        peer = RosPeer(robot_type, ros=self.ros, kind=self.kind, stamped=self.stamped)
+        peer = RosPeer(robot_type, ros=self.ros, kind=self.kind, stamped=self.stamped, split=self.split)
         yield peer
         peer.close()
 
@@ -45,12 +48,26 @@ class TestRos1Arm(DriverContract):
         assert not peer.server.errors
         assert not peer.robot.rejected
 
+    def test_a_motion_ends_in_time_after_a_cut(self, connected: Driver, peer: RosPeer) -> None:
+        """The last trajectory is short, so a lost agent moves nothing for long."""
+        target = [value + 0.5 for value in peer.joint_positions()]
+        self.until(lambda: connected.send(target) and max(map(abs, peer.joint_velocities())) > 0.5)
+        cut_s = peer.cut()
+        assert peer.wait(lambda robot: robot.joints.at_rest) - cut_s <= REST_S
+
 
 class TestRos2Base(TestRos1Arm):
     """A robot on wheels with a head."""
 
     type_name = "qbo"
     ros, stamped = 2, True
+
+
+@pytest.mark.long
+class TestTwoControllers(TestRos1Arm):
+    """An arm whose joints belong to two trajectory controllers."""
+
+    split = True
 
 
 @pytest.mark.long

@@ -114,7 +114,7 @@ def test_a_replaced_goal_that_met_an_obstacle_stops(driver: RosDriver, peer: Ros
     peer.change(lambda robot, _: robot.action.ended.append((first, "preempted", -1, "a new goal")))
     time.sleep(0.1)
     assert not driver.faults(), "this is the usual end of a replaced goal"
-    peer.change(lambda robot, server: server._clients[-1].goals.add(first))
+    peer.change(lambda _, server: server._clients[-1].goals.add(first))
     peer.change(lambda robot, _: robot.action.ended.append((first, "aborted", -4, "obstacle")))
     until(lambda: any("obstacle" in fault.message for fault in driver.faults()))
 
@@ -125,7 +125,7 @@ def test_a_goal_of_another_program_stops(driver: RosDriver, peer: RosPeer) -> No
     time_from_start = {"secs": 0, "nsecs": 50_000_000}
     point = {"positions": list(HOME), "velocities": [0.0] * 6, "time_from_start": time_from_start}
     other = {"joint_names": peer.robot.names, "points": [point]}
-    peer.change(lambda robot, _: robot.action.start("rviz-1", other))
+    peer.change(lambda robot, _: robot.start_goal("rviz-1", {"trajectory": other}))
     until(driver.faults)
     assert "because another program sent a goal" in driver.faults()[0].message
 
@@ -157,7 +157,7 @@ def test_halting_without_a_position_cancels_the_goal(driver: RosDriver, peer: Ro
 
 def test_a_missing_action_server_is_reported() -> None:
     first, second = RosPeer(TYPE, ros=1, kind="goal"), RosPeer(TYPE, ros=2, kind="goal")
-    first.change(lambda robot, server: server.types.pop("/arm_controller/follow_joint_trajectory/status"))
+    first.change(lambda robot, _: setattr(robot, "status", lambda: None))
     ros1 = create(first)
     with pytest.raises(UnreachableError, match="no action server at /arm_controller/follow_joint_trajectory"):
         ros1.connect()

@@ -225,11 +225,11 @@ def test_halting_brakes_also_for_delayed_commands(driver: RosDriver, peer: RosPe
         publish(publication)
 
     def halted_meanwhile(publication: Any) -> None:
-        connection.publish = brake  # type: ignore[method-assign]
+        connection.publish = brake  # type: ignore[method-assign, assignment]
         driver.halt()  # of the supervisor, while this thread sends
         publish(publication)
 
-    connection.publish = halted_meanwhile  # type: ignore[method-assign]
+    connection.publish = halted_meanwhile  # type: ignore[method-assign, assignment]
     halted_s = peer.robot.joints.time_s
     with pytest.raises(DriverError, match="was halted"):
         until(lambda: not driver.send(target))

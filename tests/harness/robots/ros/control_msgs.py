@@ -1,6 +1,6 @@
-"""Generates the Python package ``control_msgs``, which Debian lacks, with ROS's own generator: ``control_msgs.py FOLDER``.
+"""Generates the Python package ``control_msgs``, which Debian lacks: ``control_msgs.py FOLDER``.
 
-Runs under the Python that has ``genpy``. Only the messages of FollowJointTrajectory are generated. Source of the
+It uses ROS's own generator. Runs under the Python that has ``genpy``. Only the messages of FollowJointTrajectory are generated. Source of the
 fields: the published definitions of ``control_msgs`` 1.5.
 """
 

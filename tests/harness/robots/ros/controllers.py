@@ -64,14 +64,14 @@ class JointController:
         """Whether no joint moves."""
         return all(abs(value) < 1e-3 for value in self.velocity.values())
 
-    def follow(self, trajectory: Mapping[str, Any]) -> None:
-        """Replace the trajectory.
+    def follow(self, trajectory: Mapping[str, Any], joints: Sequence[str] = ()) -> None:
+        """Replace the trajectory of all joints, or of those of one of several controllers.
 
         Raises:
             RejectedError: It is invalid.
         """
         names, points = trajectory["joint_names"], trajectory["points"]
-        if sorted(names) != sorted(self.names) or not points:
+        if sorted(names) != sorted(joints or self.names) or not points:
             raise RejectedError(f"joints {names} for the controller of {list(self.names)}")
         end_s = 0.0
         states = [(0.0, [self._desired[name] for name in names])]

@@ -29,12 +29,22 @@ class RosPeer:
         ros: Version of ROS.
         kind: Kind of the command topic, as in the driver's options.
         stamped: Whether the velocity of the base is a TwistStamped.
+        split: Whether the joints have two controllers.
     """
 
-    def __init__(self, robot_type: RobotType, *, ros: int = 1, kind: str = "trajectory", stamped: bool = False) -> None:
+    def __init__(
+        self,
+        robot_type: RobotType,
+        *,
+        ros: int = 1,
+        kind: str = "trajectory",
+        stamped: bool = False,
+        split: bool = False,
+    ) -> None:
+        self._split = split
         self._type, self._ros, self._kind, self._stamped = robot_type, ros, kind, stamped
         self._lock = threading.Lock()
-        self.robot = Robot(robot_type, ros=ros, kind=kind, stamped=stamped)
+        self.robot = Robot(robot_type, ros=ros, kind=kind, stamped=stamped, split=split)
         self.server = RosbridgeServer(self.robot.types(), self._receive, ros, self._receive_goal)
         self.server.actions[topics.ACTION] = "control_msgs/action/FollowJointTrajectory"
         self.server.latched[topics.SAFETY] = {"data": False}
@@ -52,11 +62,13 @@ class RosPeer:
             command |= {"topic": topics.ACTION, "rate_hz": 20}
         if self._kind == "positions":
             command["joints"] = self.robot.names[::-1]
+        arm = {**command, "joints": self.robot.names[:3]}
+        wrist = {"topic": topics.WRIST, "joints": self.robot.names[3:]}
         options: dict[str, object] = {
             "address": f"127.0.0.1:{self.server.port}",
             "ros": self._ros,
             "names": {joint.name: f"{joint.name}_joint" for joint in self._type.joints},
-            "command": command,
+            "command": [arm, wrist] if self._split else command,
             "battery": topics.BATTERY,
             "diagnostics": topics.DIAGNOSTICS,
             "stopping_diagnostics": ["arm"],

@@ -16,6 +16,8 @@ JOINT_STATES, SAFETY, DIAGNOSTICS, BATTERY = "/joint_states", "/emergency_stop",
 CMD_VEL, ODOMETRY, TF = "/cmd_vel", "/odom", "/tf"
 PICTURES = "/camera/image_raw/compressed"
 COMMAND = "/arm_controller/command"
+WRIST = "/wrist_controller/command"
+"""Topic of the last three joints, if there are two controllers."""
 ACTION = "/arm_controller/follow_joint_trajectory"
 _PICTURE = simplejpeg.encode_jpeg(np.full((120, 160, 3), 128, np.uint8))
 _COMMANDS = {
@@ -36,7 +38,8 @@ class Robot:
         rejected: Commands that a controller did not accept.
     """
 
-    def __init__(self, robot_type: RobotType, *, ros: int, kind: str, stamped: bool) -> None:
+    def __init__(self, robot_type: RobotType, *, ros: int, kind: str, stamped: bool, split: bool) -> None:
+        self._split = split
         self._ros, self._kind, self._stamped = ros, kind, stamped
         self.names = [f"{joint.name}_joint" for joint in robot_type.joints]
         home = [robot_type.home_rad[joint.name] for joint in robot_type.joints]
@@ -65,6 +68,7 @@ class Robot:
             PICTURES: "sensor_msgs/CompressedImage",
             CMD_VEL: "geometry_msgs/TwistStamped" if self._stamped else "geometry_msgs/Twist",
             self.command_topic: _COMMANDS[self._kind][1],
+            WRIST: "trajectory_msgs/JointTrajectory",
             f"{ACTION}/cancel": "actionlib_msgs/GoalID",
             f"{ACTION}/result": "control_msgs/FollowJointTrajectoryActionResult",
             f"{ACTION}/status": "actionlib_msgs/GoalStatusArray",
@@ -93,7 +97,13 @@ class Robot:
         elif self._kind == "joint_state":
             self.joints.approach(message["name"], message["position"])
         else:
-            self.joints.follow(message)
+            self.joints.follow(message, self.controlled(topic))
+
+    def controlled(self, topic: str) -> list[str]:
+        """Joints of the controller with this topic."""
+        if not self._split:
+            return self.names
+        return self.names[3:] if topic == WRIST else self.names[:3]
 
     def start_goal(self, number: str, goal: Mapping[str, Any]) -> None:
         """Execute a goal of ROS 2."""
@@ -173,7 +183,11 @@ class Robot:
         for number, outcome, code, text in ended:
             result = {"error_code": code, "error_string": text}
             if self._ros == 1:
-                state = {"goal_id": {"stamp": self.time(0), "id": number}, "status": _ROS1[outcome], "text": text}
+                state: dict[str, Any] = {
+                    "goal_id": {"stamp": self.time(0), "id": number},
+                    "status": _ROS1[outcome],
+                    "text": text,
+                }
                 results.append({"status": state, "result": result})
             elif outcome == "rejected":
                 results.append({"action": ACTION, "id": number, "values": text, "status": 0, "result": False})

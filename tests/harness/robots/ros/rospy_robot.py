@@ -36,7 +36,7 @@ def main():
         print(json.dumps(robot.state()), flush=True)
 
 
-class Corrupted(JointState):
+class Corrupted(JointState):  # type: ignore[misc]
     """A message whose bytes are replaced."""
 
     def __init__(self, corrupt):
