@@ -1,4 +1,4 @@
-"""``examples/ros_bridge.py`` with ROS's own tools: ``docs/robots/ros.md``, section 6."""
+"""``examples/ros_bridge.py`` with ROS's own tools: ``docs/robots/ros.md``, section 7."""
 
 import contextlib
 import json
@@ -151,9 +151,7 @@ def test_rostopic_drives_a_base_with_a_lease_only(
         wait_until(lambda: base.base_twist().forward_m_s > 0.15, "motion with the new credentials")
         assert "control was lost" not in output.read_text()
         end(driving, signal.SIGKILL)
-        print("speed", [base.base_twist().forward_m_s for _ in range(3)])
         wait_until(lambda: abs(base.base_twist().forward_m_s) < 0.01, "rest without velocities")
-        print("speed", [base.base_twist().forward_m_s for _ in range(3)])
         system.run("rostopic", "pub", "-1", "/telescope/wheels/control", "std_msgs/Bool", "data: false")
         wait_until(lambda: "released wheels" in output.read_text(), "the release")
         rejected = output.read_text().count("rejected: not in control")

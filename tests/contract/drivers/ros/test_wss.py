@@ -1,6 +1,7 @@
 """The driver over TLS: the certificate and the host name of rosbridge are verified."""
 
-import datetime
+import contextlib
+import datetime as dt
 import ipaddress
 import socket
 import ssl
@@ -22,11 +23,11 @@ def write_certificate(file: Path, address: str) -> None:
     """A self-signed certificate and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "rosbridge")])
-    now = datetime.datetime.now(datetime.UTC)
+    now = dt.datetime.now(dt.UTC)
     certificate = (
         x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(days=1))
-        .not_valid_after(now + datetime.timedelta(days=1))
+        .not_valid_before(now - dt.timedelta(days=1))
+        .not_valid_after(now + dt.timedelta(days=1))
         .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(address))]), critical=False)
         .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
         .sign(key, hashes.SHA256())
@@ -52,7 +53,7 @@ class TlsServer:
     def close(self) -> None:
         self._server.close()
         for each in self._sockets:
-            each.close()
+            end(each)
 
     def _accept(self) -> None:
         while True:
@@ -68,14 +69,16 @@ class TlsServer:
                 threading.Thread(target=forward, args=(source, target), daemon=True).start()
 
 
+def end(each: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        each.shutdown(socket.SHUT_RDWR)
+
+
 def forward(source: socket.socket, target: socket.socket) -> None:
-    try:
+    with contextlib.suppress(OSError, ValueError):
         while data := source.recv(65536):
             target.sendall(data)
-    except (OSError, ValueError):
-        pass
-    finally:
-        target.close()
+    end(target)
 
 
 @pytest.fixture
@@ -123,7 +126,7 @@ def test_a_certificate_of_another_host_is_rejected(peer: RosPeer, tmp_path: Path
 
 def test_a_missing_file_and_a_server_without_tls_are_reported(peer: RosPeer, certificate: Path) -> None:
     plain = f"wss://127.0.0.1:{peer.server.port}"
-    with pytest.raises(UnreachableError, match="option 'certificate_authority': /none.pem contains no certificates"):
+    with pytest.raises(UnreachableError, match=r"option 'certificate_authority': /none\.pem contains no certificates"):
         create(peer, address=plain, certificate_authority="/none.pem").connect()
     with pytest.raises(UnreachableError, match="is no rosbridge server"):
         create(peer, address=plain, certificate_authority=str(certificate)).connect()

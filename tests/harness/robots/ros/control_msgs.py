@@ -1,7 +1,7 @@
 """Generates the Python package ``control_msgs``, which Debian lacks: ``control_msgs.py FOLDER``.
 
-It uses ROS's own generator. Runs under the Python that has ``genpy``. Only the messages of FollowJointTrajectory are generated. Source of the
-fields: the published definitions of ``control_msgs`` 1.5.
+It uses ROS's own generator, under the Python that has ``genpy``. Only the messages of FollowJointTrajectory are
+generated. Source of the fields: the published definitions of ``control_msgs`` 1.5.
 """
 
 import importlib
