@@ -125,7 +125,7 @@ def test_raw_pictures_are_frames_and_scans_are_streams(picture: dict[str, Any]) 
         robot.step = publish
 
     peer.change(offer)
-    sonar = QBO.streams[0].name
+    sonar = "sonar"
     options = {**peer.options(), "cameras": {"eyes": {"raw": "/image"}}, "scans": {sonar: "/scan"}}
     driver = drivers.load("ros")(QBO, ROBOTS / "qbo", options, "qbo")
     assert isinstance(driver, RosBaseDriver)
@@ -157,7 +157,7 @@ def test_other_data_are_no_picture(cut: int) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"speed": 1}, "driver 'ros' has no option 'speed'; it has: connection, address, master"),
+        ({"speed": 1}, "driver 'ros' has no option 'speed'; it has: connection, address, certificate_authority"),
         ({"command": {}}, r"missing required field `topic` - at `\$.command`"),
         ({"command": {"topic": "/c", "speed": 1}}, r"unknown field `speed` - at `\$.command`"),
         ({"connection": "rospy", "ros": 2}, 'use "rosbridge" with ROS 2'),
@@ -167,7 +167,7 @@ def test_other_data_are_no_picture(cut: int) -> None:
         ({"names": {"thumb": "thumb_joint"}}, "robot type 'ur5' has no 'thumb'; it has: shoulder_pan"),
         ({"cameras": {"eye": "/camera"}}, "option 'cameras': robot type 'ur5' has no 'eye'; it has: none"),
         ({"names": {"elbow": "wrist_1"}}, "two joints have the same name"),
-        ({"command": {"topic": "/c", "kind": "positions"}}, "must list the joints in the controller's order"),
+        ({"command": {"topic": "/c", "kind": "positions"}}, "must list the joints of /c in the controller's order"),
         ({"command": {"topic": "/c", "joints": ["elbow"]}}, "each joint must be listed once, .* check shoulder_lift"),
         ({"command": [{"topic": "/c"}, {"topic": "/d"}]}, "must list the joints of /c"),
         ({"command": [{"topic": "/c", "joints": ["elbow"]}, {"topic": "/d", "joints": ["elbow"]}]}, "check elbow"),

@@ -179,7 +179,7 @@ class Robot:
     def results(self) -> list[dict[str, Any]]:
         """Results of the goals that have ended, for ROS 1; for ROS 2 without ``op``."""
         ended, self.action.ended = self.action.ended, []
-        results = []
+        results: list[dict[str, Any]] = []
         for number, outcome, code, text in ended:
             result = {"error_code": code, "error_string": text}
             if self._ros == 1:
