@@ -20,18 +20,19 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
-import paho.mqtt.client as mqtt
-from telescope_client import call, connect_to_broker, find_device, topic
+import requests
+from broker_link import BrokerLink
+from telescope_client import call, find_device, topic
 
-from device_agent.drivers.ros.connection import Connection, Subscription
-from device_agent.drivers.ros.joint_commands import Publication
-from device_agent.drivers.ros.messages import NS, Dialect, Time, Twist
-from device_agent.drivers.ros.rosbridge import RosbridgeChannel
-from device_agent.drivers.ros.rospy_channel import RospyChannel
+from device_agent.middleware.ros.connection import Connection, Publication, Subscription
+from device_agent.middleware.ros.messages import NS, Dialect, Time, Twist
+from device_agent.middleware.ros.rosbridge import RosbridgeChannel
+from device_agent.middleware.ros.rospy_channel import RospyChannel
 from device_agent.ports.driver import UnreachableError
 from device_agent.protocol.security import setpoints
 
 RENEW_S = 10.0
+"""Time between two renewals of the lease [s]."""
 REACHED_RAD = 0.02
 SETTLE_S = 2.0
 """Time to reach the last point of a trajectory after its time [s]."""
@@ -99,7 +100,7 @@ class Control:
 
     epoch: int
     key: bytes
-    client: mqtt.Client
+    link: BrokerLink
     topic: str
     sequence: int = 0
     input: int = 0
@@ -113,12 +114,21 @@ class Bridge:
     Args:
         device: The device, as the API describes it.
         ros: Version of ROS.
+        renew_s: Longest time between two renewals of credentials [s].
     """
 
-    def __init__(self, device: dict[str, Any], ros: int) -> None:
+    def __init__(self, device: dict[str, Any], ros: int, renew_s: float) -> None:
         self.device = device
-        self.dialect = Dialect(ros)
         self.stopping = threading.Event()
+        self.watcher = BrokerLink(
+            {"purpose": "view"},
+            renew_s,
+            subscriptions=[(topic(device, "desc"), 1), (topic(device, "tele/joints"), 0)],
+            on_message=self.on_message,
+            on_lost=self.stopping.set,
+        )
+        self._renew_s = renew_s
+        self.dialect = Dialect(ros)
         self.connection: Connection | None = None
         self._root = f"/telescope/{device['name']}".replace("-", "_")
         self._joints: list[str] = []
@@ -246,9 +256,8 @@ class Bridge:
                 "input": control.input,
                 "target": target,
             }
-            control.client.publish(
-                control.topic, setpoints.seal(json.dumps(setpoint).encode(), control.key, control.topic), qos=0
-            )
+            sealed = setpoints.seal(json.dumps(setpoint).encode(), control.key, control.topic)
+            control.link.publish(control.topic, sealed)
 
     def _target(self, now_s: float) -> dict[str, Any] | None:
         twist, trajectory = self._twist, self._trajectory
@@ -270,13 +279,14 @@ class Bridge:
             return
         try:
             lease = call("POST", f"/devices/{self.device['id']}/lease", {})
-            client = connect_to_broker({"purpose": "control", "device": self.device["id"], "epoch": lease["epoch"]})
+            request = {"purpose": "control", "device": self.device["id"], "epoch": lease["epoch"]}
+            link = BrokerLink(request, self._renew_s)
+            link.renew()
         except SystemExit as error:
             self.report(f"rejected: {error}")
             return
-        client.loop_start()
         name = topic(self.device, f"ctl/{lease['epoch']}")
-        control = Control(lease["epoch"], bytes.fromhex(lease["setpoint_key"]), client, name)
+        control = Control(lease["epoch"], bytes.fromhex(lease["setpoint_key"]), link, name)
         threading.Thread(target=self._renew, args=(control,), daemon=True).start()
         self._control = control
 
@@ -299,9 +309,26 @@ class Bridge:
                 call("DELETE", f"/devices/{self.device['id']}/lease?epoch={control.epoch}")
             except SystemExit as error:
                 reason = str(error)
-        control.client.disconnect()
-        control.client.loop_stop()
+        control.link.close()
         self.report(reason or f"released {self.device['name']}")
+
+    def renew_due(self) -> None:
+        """Renew the credentials that are due. The previous ones stay valid if the server does not respond."""
+        control = self._control
+        for link in (self.watcher, control.link if control is not None else None):
+            if link is not None and time.monotonic() > link.renew_s:
+                link.renew_s = time.monotonic() + RENEW_S
+                self._requests.submit(self._renew_link, link)
+
+    def _renew_link(self, link: BrokerLink) -> None:
+        control = self._control
+        if link is not self.watcher and (control is None or control.link is not link):
+            return  # released meanwhile
+        try:
+            link.renew()
+            print("renewed credentials", flush=True)
+        except (SystemExit, requests.RequestException) as error:
+            print(f"credentials are not renewed: {error}", flush=True)
 
     def close(self) -> None:
         """Release control, and end."""
@@ -314,15 +341,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("device")
     parser.add_argument("--ros", type=int, choices=(1, 2), default=1, help="version of ROS")
-    parser.add_argument("--rosbridge", default="", metavar="HOST:PORT", help="use rosbridge; otherwise rospy")
+    parser.add_argument("--rosbridge", default="", metavar="[wss://]HOST:PORT", help="use rosbridge; otherwise rospy")
+    parser.add_argument("--certificate-authority", default="", metavar="FILE", help="certificates for wss://")
+    parser.add_argument(
+        "--renew", type=float, default=300.0, metavar="SECONDS", help="longest time between renewals of credentials"
+    )
     parser.add_argument("--master", default="http://127.0.0.1:11311", help="address of the ROS master, for rospy")
     parser.add_argument("--python", default="/usr/bin/python3", help="Python interpreter with rospy")
     options = parser.parse_args()
-    bridge = Bridge(find_device(options.device), options.ros)
+    bridge = Bridge(find_device(options.device), options.ros, options.renew)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: bridge.stopping.set())
     channel = (
-        RosbridgeChannel(options.rosbridge)
+        RosbridgeChannel(options.rosbridge, certificate_authority=options.certificate_authority)
         if options.rosbridge
         else RospyChannel(python=options.python, folders=(), master=options.master, node="telescope_bridge")
     )
@@ -333,22 +364,16 @@ def main() -> None:
         device=options.device,
         clock=time.monotonic,
     )
-    watcher = connect_to_broker({"purpose": "view"})
-    watcher.on_message = lambda _client, _data, message: bridge.on_message(message.topic, bytes(message.payload))
-    watcher.on_connect = lambda *_: watcher.subscribe(
-        [(topic(bridge.device, "desc"), 1), (topic(bridge.device, "tele/joints"), 0)]
-    )
-    watcher.on_disconnect = lambda *_: bridge.stopping.set()
-    watcher.loop_start()
+    bridge.watcher.renew()
     print("ready", flush=True)
     problem = ""
     while not bridge.stopping.wait(0.2) and not bridge.connection.lost:
+        bridge.renew_due()
         if bridge.connection.problem != problem:
             problem = bridge.connection.problem
             bridge.report(f"rejected: {problem}")
     bridge.close()
-    watcher.disconnect()
-    watcher.loop_stop()
+    bridge.watcher.close()
     bridge.connection.close()
 
 

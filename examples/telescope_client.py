@@ -36,13 +36,19 @@ def find_device(name: str) -> dict[str, Any]:
 
 def connect_to_broker(request: dict[str, Any]) -> mqtt.Client:
     """Return a connected MQTT client with the rights of ``POST /mqtt/credentials``."""
+    client, credentials = create_client(request)
+    client.connect(credentials["tcp"]["host"], credentials["tcp"]["port"])
+    return client
+
+
+def create_client(request: dict[str, Any]) -> tuple[mqtt.Client, dict[str, Any]]:
+    """Return an MQTT client that is not connected yet, and its credentials with ``lifetime_s`` and ``tcp``."""
     credentials = call("POST", "/mqtt/credentials", request)
     client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, client_id=credentials["client_id"], protocol=mqtt.MQTTv311)
     client.username_pw_set(credentials["username"], credentials["password"])
     if credentials["tcp"]["tls"]:
         client.tls_set()
-    client.connect(credentials["tcp"]["host"], credentials["tcp"]["port"])
-    return client
+    return client, credentials
 
 
 def topic(device: dict[str, Any], suffix: str) -> str:

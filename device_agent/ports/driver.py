@@ -42,6 +42,8 @@ class Observation:
         frames: Pose of each of the type's ``frames`` in the robot's base frame.
         at_s: When the device sent new values last, on the agent's monotonic clock [s]; ``None``: just now. A message
             that repeats the device's previous timestamp is not new.
+        settled: False while the device's own controller has not reported the end of the last command. A motion is not
+            done before. Devices without such reports are always settled.
     """
 
     position_rad: tuple[float, ...]
@@ -49,6 +51,7 @@ class Observation:
     effort_nm: tuple[float, ...]
     frames: tuple[Pose, ...]
     at_s: float | None = None
+    settled: bool = True
 
 
 class Driver(Protocol):

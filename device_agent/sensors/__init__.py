@@ -18,6 +18,7 @@ GROUP = "telescope.sensors"
 _BUILT_IN: Mapping[str, str] = {
     "mujoco": "device_agent.sensors.mujoco",
     "perception": "device_agent.sensors.perception",
+    "ros": "device_agent.sensors.ros",
 }
 """Name → module that defines ``create``."""
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from device_agent.drivers.bridge_process import BridgeProcess
+from device_agent.middleware.bridge_process import BridgeProcess
 from device_agent.ports.driver import UnreachableError
 from device_agent.ports.skills import SkillError
 from device_agent.ports.threads import SupervisedThread

@@ -4,13 +4,12 @@ import contextlib
 from pathlib import Path
 
 from device_agent.drivers.command_limits import limit_twist
-from device_agent.drivers.ros import messages
-from device_agent.drivers.ros.connection import Connection
 from device_agent.drivers.ros.driver import RosDriver
-from device_agent.drivers.ros.joint_commands import Publication
 from device_agent.drivers.ros.joint_states import Measurement
 from device_agent.drivers.ros.options import Base, Options
 from device_agent.drivers.watchdog import CommandWatchdog
+from device_agent.middleware.ros import messages
+from device_agent.middleware.ros.connection import Connection, Publication
 from device_agent.ports.driver import REST, Twist, UnreachableError
 from device_agent.protocol.manifests.robot_type import RobotType
 

@@ -1,6 +1,5 @@
 """Driver of a robot with ROS. ``device_agent/ports/driver.py`` documents each method."""
 
-import re
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -8,19 +7,21 @@ from pathlib import Path
 from typing import Any
 
 from device_agent.drivers.command_limits import limit_positions
-from device_agent.drivers.ros import messages
-from device_agent.drivers.ros.connection import Channel, Connection, Subscription
-from device_agent.drivers.ros.joint_commands import JointCommands, Publication
+from device_agent.drivers.ros.goals import Goals
+from device_agent.drivers.ros.joint_commands import JointCommands
 from device_agent.drivers.ros.joint_states import JointStates, Measurement
-from device_agent.drivers.ros.messages import Dialect
-from device_agent.drivers.ros.options import Options
+from device_agent.drivers.ros.options import Options, RawCamera
 from device_agent.drivers.ros.pictures import Pictures
 from device_agent.drivers.ros.robot_status import RobotStatus
-from device_agent.drivers.ros.rosbridge import RosbridgeChannel
-from device_agent.drivers.ros.rospy_channel import RospyChannel
+from device_agent.middleware.ros import messages
+from device_agent.middleware.ros.connection import Command, Connection, Subscription
+from device_agent.middleware.ros.images import RawImage
+from device_agent.middleware.ros.messages import Dialect
+from device_agent.middleware.ros.scans import LaserScan
 from device_agent.ports.driver import DriverError, DriverFault, Observation, UnreachableError
 from device_agent.ports.sensor import Frame
 from device_agent.protocol import Twin
+from device_agent.protocol.description import Stream
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.simulation.mjcf.robot_model import RobotModel
 
@@ -49,7 +50,7 @@ class RosDriver:
         self._device = device
         self._names = [options.names.get(joint.name, joint.name) for joint in robot_type.joints]
         self._dialect = Dialect(options.ros)
-        self._commands = JointCommands(robot_type, self._names, options.command, self._dialect)
+        self._commands = self._new_commands()
         self._states = self._new_states()
         self._status = RobotStatus(options)
         self._pictures = Pictures(options.cameras)
@@ -65,12 +66,14 @@ class RosDriver:
         """Connect, wait for a second measurement of every joint, and let the arm hold its position."""
         self.close()
         self._states, self._status = self._new_states(), RobotStatus(self._options)
+        self._commands = self._new_commands()
         connection = Connection(
-            self._open(),
+            self._options.open(self._device),
             subscriptions=self._subscriptions(self._states, self._status),
             advertised=self._advertised(),
             device=self._device,
             clock=time.monotonic,
+            results={goals.action: goals.accept_ros2 for goals in self._goals},
         )
         try:
             measured = self._wait(connection)
@@ -86,29 +89,37 @@ class RosDriver:
 
     def observe(self) -> Observation:
         """The newest measurement."""
-        newest = self._measured(self._connected())
+        connection, now_s = self._connected(), time.monotonic()
+        newest = self._measured(connection)
+        for goals in self._goals:
+            cancellation = goals.cancel_overdue(now_s)
+            if cancellation is not None:
+                connection.publish(cancellation)
         return Observation(
             newest.position_rad,
             newest.velocity_rad_s,
             newest.effort_nm,
             self._model.frames(newest.position_rad),
             at_s=newest.at_s,
+            settled=not any(goals.pending for goals in self._goals),
         )
 
     def faults(self) -> tuple[DriverFault, ...]:
-        """Safety topics and diagnostics."""
+        """Safety topics, diagnostics and goals that have failed."""
         connection = self._connection
-        return () if connection is None or connection.lost else self._status.faults()
+        return () if connection is None or connection.lost else self._faults()
 
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
         """Command positions within the limits of the joints."""
         connection = self._free()
         applied = limit_positions(self._type, position_rad)
-        self._command(connection, self._commands.towards(applied, self._measured(connection), time.monotonic()))
+        measured, now_s = self._measured(connection), time.monotonic()
+        for commands in self._commands:
+            self._command(connection, commands.towards(applied, measured, now_s))
         return applied
 
     def report(self, stream: str) -> Mapping[str, float | bool]:
-        """``health``: battery; ``odometry``: pose and velocity of the base."""
+        """``health``: battery; ``odometry``: pose and velocity of the base; others: ranges of a scan."""
         connection = self._connection
         return {} if connection is None or connection.lost else self._status.report(stream)
 
@@ -131,13 +142,6 @@ class RosDriver:
 
     # ------------------------------------------------------------ topics
 
-    def _open(self) -> Channel:
-        options = self._options
-        if options.connection == "rosbridge":
-            return RosbridgeChannel(options.address)
-        node = "telescope_" + re.sub(r"\W", "_", self._device)
-        return RospyChannel(python=options.python, folders=options.python_folders, master=options.master, node=node)
-
     def _subscriptions(self, states: JointStates, status: RobotStatus) -> list[Subscription]:
         options, subscriptions = self._options, []
 
@@ -148,12 +152,9 @@ class RosDriver:
         add(options.joint_states, "sensor_msgs/JointState", messages.JointState, states.accept)
         add(options.battery, "sensor_msgs/BatteryState", messages.BatteryState, status.accept_battery)
         add(options.diagnostics, "diagnostic_msgs/DiagnosticArray", messages.DiagnosticArray, status.accept_diagnostics)
-        for camera in self._type.cameras:
-            if camera.name in options.cameras:
-                kind = self._dialect.type("sensor_msgs/CompressedImage")
-                accept = partial(self._pictures.accept, camera.name)
-                topic, period_ms = options.cameras[camera.name], round(1000 / camera.rate_hz)
-                subscriptions.append(Subscription(topic, kind, messages.CompressedImage, accept, period_ms))
+        for stream, topic in options.scans.items():
+            add(topic, "sensor_msgs/LaserScan", LaserScan, partial(status.accept_scan, stream))
+        subscriptions += [self._camera(camera) for camera in self._type.cameras if camera.name in options.cameras]
         for safety in options.safety:
             add(safety.topic, safety.type, dict[str, Any], partial(status.accept_safety, safety))
         if options.base is not None:
@@ -162,18 +163,44 @@ class RosDriver:
                 add("/tf", "tf2_msgs/TFMessage", messages.Transforms, status.transforms.accept)
                 static = partial(status.transforms.accept, static=True)
                 add("/tf_static", "tf2_msgs/TFMessage", messages.Transforms, static)
-        return subscriptions
+        return [*subscriptions, *(each for goals in self._goals for each in goals.subscriptions)]
+
+    def _camera(self, camera: Stream) -> Subscription:
+        source, period_ms = self._options.cameras[camera.name], round(1000 / camera.rate_hz)
+        if isinstance(source, RawCamera):
+            kind, accept_raw = self._dialect.type("sensor_msgs/Image"), partial(self._pictures.accept_raw, camera.name)
+            return Subscription(source.raw, kind, RawImage, accept_raw, period_ms)
+        kind, accept = self._dialect.type("sensor_msgs/CompressedImage"), partial(self._pictures.accept, camera.name)
+        return Subscription(source, kind, messages.CompressedImage, accept, period_ms)
 
     def _advertised(self) -> dict[str, str]:
-        return {self._commands.topic: self._commands.type}
+        return {topic: kind for commands in self._commands for topic, kind in commands.advertised.items()}
 
     # ------------------------------------------------------------ measurements
 
     def _new_states(self) -> JointStates:
         return JointStates(self._names, check_delay=not self._options.simulated)
 
+    def _new_commands(self) -> tuple[JointCommands, ...]:
+        controllers = self._options.controllers
+        return tuple(JointCommands(self._type, self._names, each, self._dialect) for each in controllers)
+
+    @property
+    def _goals(self) -> list[Goals]:
+        return [commands.goals for commands in self._commands if commands.goals is not None]
+
+    @property
+    def _missing_server(self) -> str:
+        """An action whose server has published nothing; empty if there is none."""
+        return next((goals.action for goals in self._goals if not goals.present), "")
+
+    def _faults(self) -> tuple[DriverFault, ...]:
+        now_s = time.monotonic()
+        problems = [problem for goals in self._goals if (problem := goals.problem(now_s))]
+        return (*self._status.faults(), *(DriverFault("goal", problem) for problem in problems))
+
     def _wait(self, connection: Connection) -> Measurement:
-        """Wait for the first measurement that is known to be new, and for all safety topics.
+        """Wait for the first measurement that is known to be new, all safety topics and all action servers.
 
         Raises:
             UnreachableError: They do not arrive in time.
@@ -181,7 +208,7 @@ class RosDriver:
         end_s = time.monotonic() + _START_S
         while not connection.lost and time.monotonic() < end_s:
             newest = self._states.newest
-            if newest is not None and not self._status.silent_safety_topic:
+            if newest is not None and not self._status.silent_safety_topic and not self._missing_server:
                 return newest
             time.sleep(_CHECK_S)
         raise self._unreachable(connection, time.monotonic() - _STALE_S)
@@ -206,6 +233,8 @@ class RosDriver:
         if missing:
             topic = self._options.joint_states
             return UnreachableError(f"{topic} has no new values of the joints {', '.join(missing)}{reason}")
+        if self._missing_server:
+            return UnreachableError(f"no action server at {self._missing_server}; start its controller{reason}")
         return UnreachableError(f"no message of the safety topic {self._status.silent_safety_topic}{reason}")
 
     # ------------------------------------------------------------ commands
@@ -226,24 +255,28 @@ class RosDriver:
             raise DriverError("the robot was halted; it reconnects")
         if connection.lost:
             raise self._unreachable(connection, time.monotonic())
-        for fault in self._status.faults():
+        for fault in self._faults():
             if fault.stops:
                 raise DriverError(f"the robot has stopped itself: {fault.message}")
         return connection
 
-    def _command(self, connection: Connection, publication: Publication | None) -> None:
+    def _command(self, connection: Connection, command: Command | None) -> None:
         """Publish a command. If the robot was halted meanwhile, halt it again: this command may have come later.
 
         Raises:
             DriverError: The connection is lost, or the robot was halted.
         """
-        if publication is not None:
-            connection.publish(publication)
+        if command is not None:
+            connection.publish(command)
         if self._halted:
             self.halt()
             raise DriverError("the robot was halted; it reconnects")
 
     def _hold(self, connection: Connection, measured: Measurement | None) -> None:
-        """Brake. An old position would be a motion back to it; without a new command the last trajectory just ends."""
-        if measured is not None and time.monotonic() - measured.at_s < _RECENT_S:
-            connection.publish(self._commands.hold(measured))
+        """Brake. An old position would be a motion back to it; then goals are cancelled, and other commands end."""
+        recent = measured is not None and time.monotonic() - measured.at_s < _RECENT_S
+        for commands in self._commands:
+            if recent and measured is not None:
+                connection.publish(commands.hold(measured))
+            elif commands.goals is not None and (cancellation := commands.goals.cancel()) is not None:
+                connection.publish(cancellation)

@@ -5,14 +5,14 @@ at rest after the horizon. While commands follow each other, it never arrives an
 arm is at rest after one horizon.
 """
 
-import itertools
-import secrets
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
 
+from device_agent.drivers.ros.goals import OVERDUE_S, Goals
 from device_agent.drivers.ros.joint_states import Measurement
-from device_agent.drivers.ros.messages import Dialect, Message
 from device_agent.drivers.ros.options import Command
+from device_agent.middleware.ros.connection import Command as Request
+from device_agent.middleware.ros.connection import Publication
+from device_agent.middleware.ros.messages import Dialect, Message
 from device_agent.protocol.manifests.robot_type import RobotType
 
 _RAMP = 2.0
@@ -25,73 +25,84 @@ _TYPES = {
     "trajectory": "trajectory_msgs/JointTrajectory",
     "positions": "std_msgs/Float64MultiArray",
     "joint_state": "sensor_msgs/JointState",
-    "goal": "control_msgs/FollowJointTrajectoryActionGoal",
 }
 
 
-class Publication(NamedTuple):
-    """A message for a topic."""
-
-    topic: str
-    message: Message
-
-
 class JointCommands:
-    """Limits the speed of commands, and writes them as messages.
+    """Limits the speed of one controller's commands, and writes them as messages.
 
     After a pause of one horizon the robot rests. Then commands start at the measured position, with a ramp.
 
     Args:
         robot_type: Limits of the joints.
         names: ROS names of the joints, in the order of the robot type.
-        command: Where commands are published.
+        command: The controller.
         dialect: Version of ROS.
+
+    Attributes:
+        goals: Goals of the action; ``None`` for controllers with a topic.
     """
 
     def __init__(self, robot_type: RobotType, names: Sequence[str], command: Command, dialect: Dialect) -> None:
-        self._joints = robot_type.joints
+        self._order = [names.index(name) for name in command.joints or names]
+        self._names = [names[index] for index in self._order]
+        self._joints = [robot_type.joints[index] for index in self._order]
         self._braking_rad_s2 = robot_type.braking_rad_s2
-        self._names = tuple(names)
         self._command = command
         self._dialect = dialect
-        self._order = [self._names.index(name) for name in command.joints]
         self._horizon_s = command.horizon_ms / 1000
         self._interval_s = max(robot_type.period_ms / 1000, 1 / command.rate_hz)
         self._position: tuple[float, ...] = ()
+        self._completed: tuple[float, ...] = ()
         self._sent_s = self._since_s = -1e9
-        self._session = secrets.token_hex(4)
-        self._numbers = itertools.count(1)
-        self.topic = f"{command.topic.rstrip('/')}/goal" if command.kind == "goal" else command.topic
-        self.type = dialect.type(_TYPES[command.kind])
+        self.goals = Goals(command.topic, dialect) if command.kind == "goal" else None
 
-    def towards(self, target_rad: Sequence[float], measured: Measurement, now_s: float) -> Publication | None:
-        """The command for a target within the limits, or ``None`` if the previous one was just sent."""
+    @property
+    def advertised(self) -> Mapping[str, str]:
+        """Topics to publish, with their types."""
+        if self.goals is not None:
+            return self.goals.advertised
+        return {self._command.topic: self._dialect.type(_TYPES[self._command.kind])}
+
+    def towards(self, target_rad: Sequence[float], measured: Measurement, now_s: float) -> Request | None:
+        """The command for a target within the limits; ``None`` if nothing has to be sent now.
+
+        Args:
+            target_rad: Positions of all joints of the robot type [rad].
+            measured: Their measurement.
+            now_s: The monotonic clock [s].
+        """
         elapsed_s = now_s - self._sent_s
         if elapsed_s < _EARLY * self._interval_s:
             return None
+        target = self._own(target_rad)
+        if self.goals is not None and target == self._completed:
+            return None  # another goal would replace this one, whose result would never arrive
         if elapsed_s > self._horizon_s:
-            self._position, self._since_s, elapsed_s = measured.position_rad, now_s, self._interval_s
+            self._position, self._since_s, elapsed_s = self._own(measured.position_rad), now_s, self._interval_s
         running_s = now_s - self._since_s + self._interval_s
         self._position = tuple(
-            position + min(max(target - position, -step), step)
-            for position, target, step in zip(
-                self._position, target_rad, self._steps(running_s, elapsed_s), strict=True
-            )
+            position + min(max(aim - position, -step), step)
+            for position, aim, step in zip(self._position, target, self._steps(running_s, elapsed_s), strict=True)
         )
         self._sent_s = now_s
-        return self._publication(self._position, self._horizon_s)
+        self._completed = target if self._position == target else ()
+        return self._request(self._position, self._horizon_s, due_s=now_s + self._horizon_s + OVERDUE_S)
 
-    def hold(self, measured: Measurement) -> Publication:
+    def hold(self, measured: Measurement) -> Request:
         """The command that brakes to rest with the deceleration of the robot type, in one horizon or longer."""
-        fastest = max((abs(value) for value in measured.velocity_rad_s), default=0.0)
-        duration_s = max(self._horizon_s, fastest / self._braking_rad_s2)
+        positions, velocities = self._own(measured.position_rad), self._own(measured.velocity_rad_s)
+        duration_s = max(self._horizon_s, max(map(abs, velocities), default=0.0) / self._braking_rad_s2)
         stops = [
             min(max(position + velocity * duration_s / 2, joint.lower_rad), joint.upper_rad)
-            for position, velocity, joint in zip(
-                measured.position_rad, measured.velocity_rad_s, self._joints, strict=True
-            )
+            for position, velocity, joint in zip(positions, velocities, self._joints, strict=True)
         ]
-        return self._publication(stops, duration_s)
+        self._completed = ()
+        return self._request(stops, duration_s, due_s=None)
+
+    def _own(self, values: Sequence[float]) -> tuple[float, ...]:
+        """Values of the controller's joints, in its order."""
+        return tuple(values[index] for index in self._order)
 
     def _steps(self, running_s: float, elapsed_s: float) -> list[float]:
         """Largest changes of the commanded positions [rad]."""
@@ -100,17 +111,13 @@ class JointCommands:
             for joint in self._joints
         ]
 
-    def _publication(self, position_rad: Sequence[float], duration_s: float) -> Publication:
-        kind = self._command.kind
+    def _request(self, position_rad: Sequence[float], duration_s: float, *, due_s: float | None) -> Request:
+        topic, kind = self._command.topic, self._command.kind
         if kind == "positions":
-            data = [position_rad[index] for index in self._order]
-            return Publication(self.topic, {"layout": {"dim": [], "data_offset": 0}, "data": data})
+            return Publication(topic, {"layout": {"dim": [], "data_offset": 0}, "data": list(position_rad)})
         if kind == "joint_state":
             # Without a header, rosbridge inserts the time of its own clock.
-            values: Message = {"name": list(self._names), "position": list(position_rad), "velocity": [], "effort": []}
-            return Publication(self.topic, values)
+            values: Message = {"name": self._names, "position": list(position_rad), "velocity": [], "effort": []}
+            return Publication(topic, values)
         trajectory = self._dialect.trajectory(self._names, position_rad, duration_s)
-        if kind == "trajectory":
-            return Publication(self.topic, trajectory)
-        number = f"telescope-{self._session}-{next(self._numbers)}"
-        return Publication(self.topic, self._dialect.goal(trajectory, number))
+        return Publication(topic, trajectory) if self.goals is None else self.goals.start(trajectory, due_s=due_s)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from device_agent.drivers.ros.messages import NS, JointState
+from device_agent.middleware.ros.messages import NS, JointState
 
 _MAX_DELAY_S = 1.0
 """A message that took this much longer than the fastest ones is outdated [s]."""

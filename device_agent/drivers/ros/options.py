@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta, Struct
 
+from device_agent.middleware.ros.endpoint import Endpoint
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.manifests.robot_type import RobotType
 
@@ -14,13 +15,14 @@ OptionalTopic = Annotated[str, Meta(pattern=r"^([/~A-Za-z][A-Za-z0-9_/]*)?$", ma
 
 
 class Command(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where joint commands are published.
+    """Where joint commands of one controller are published.
 
     Attributes:
         topic: Topic; for ``goal`` the name of the action.
         kind: ``trajectory``: JointTrajectory. ``positions``: Float64MultiArray. ``joint_state``: JointState. ``goal``:
-            FollowJointTrajectory (ROS 1).
-        joints: ROS names of the joints in the controller's order; only for ``positions``, whose messages have no names.
+            FollowJointTrajectory.
+        joints: ROS names of the controller's joints. It is required for ``positions``, whose messages have no names,
+            in the controller's order, and if there are several controllers.
         horizon_ms: Duration of each trajectory [ms]. The arm comes to rest after this time without commands.
         rate_hz: Commands per second, at most one in each control period [Hz].
     """
@@ -66,44 +68,47 @@ class Safety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     normal: Annotated[tuple[bool | int | str, ...], Meta(min_length=1)]
 
 
-class Options(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All options.
+class RawCamera(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A camera without JPEGs.
 
     Attributes:
-        connection: How ROS is reached: through a rosbridge server, or with ``rospy`` in a process of its own (ROS 1).
-        address: Host and port of rosbridge.
-        master: Address of the ROS master, for ``rospy``.
-        python: Interpreter that has ``rospy``.
-        python_folders: Folders of ROS's Python packages, if the interpreter does not find them.
-        ros: Version of ROS: 1 or 2.
-        simulated: Whether the robot is a simulation, for example Gazebo. Operators see it.
+        raw: Topic of Image: colours, or depths for display.
+    """
+
+    raw: Topic
+
+
+class Options(Endpoint, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """All options, with those of ``Endpoint``.
+
+    Attributes:
         joint_states: Topic of JointState.
         names: Joint of the robot type → name of the joint in ROS; only for those that differ.
-        command: Where joint commands are published.
+        command: Where joint commands are published: one controller, or several that have different joints.
         base: Topics of a mobile base.
-        cameras: Camera of the robot type → topic of CompressedImage with JPEGs.
+        cameras: Camera of the robot type → topic of CompressedImage with JPEGs, or a raw camera.
+        scans: Stream of the robot type → topic of LaserScan.
         battery: Topic of BatteryState; empty for none.
         diagnostics: Topic of DiagnosticArray; empty for none.
         stopping_diagnostics: Beginnings of names in the diagnostics. With an error of such a part the robot stops.
         safety: Topics that tell whether the robot may move.
     """
 
-    connection: Literal["rosbridge", "rospy"] = "rosbridge"
-    address: Annotated[str, Meta(pattern=r"^[^:/\s]+(:[0-9]{1,5})?$")] = "127.0.0.1:9090"
-    master: Annotated[str, Meta(pattern=r"^http://[^:/\s]+:[0-9]{1,5}/?$")] = "http://127.0.0.1:11311"
-    python: str = "/usr/bin/python3"
-    python_folders: tuple[str, ...] = ()
-    ros: Literal[1, 2] = 1
-    simulated: bool = False
     joint_states: Topic = "/joint_states"
-    names: dict[str, str] = {}
-    command: Command
+    names: dict[str, str] = msgspec.field(default_factory=dict)
+    command: Command | Annotated[tuple[Command, ...], Meta(min_length=1, max_length=8)]
     base: Base | None = None
-    cameras: dict[str, Topic] = {}
+    cameras: dict[str, Topic | RawCamera] = msgspec.field(default_factory=dict)
+    scans: dict[str, Topic] = msgspec.field(default_factory=dict)
     battery: OptionalTopic = ""
     diagnostics: OptionalTopic = ""
     stopping_diagnostics: tuple[str, ...] = ()
     safety: Annotated[tuple[Safety, ...], Meta(max_length=8)] = ()
+
+    @property
+    def controllers(self) -> tuple[Command, ...]:
+        """The controllers of the joints."""
+        return (self.command,) if isinstance(self.command, Command) else self.command
 
 
 def parse(options: Mapping[str, object], robot_type: RobotType) -> Options:
@@ -127,7 +132,13 @@ def parse(options: Mapping[str, object], robot_type: RobotType) -> Options:
 def _check(options: Options, robot_type: RobotType) -> None:
     joints = [joint.name for joint in robot_type.joints]
     cameras = [camera.name for camera in robot_type.cameras]
-    for option, used, known in (("names", options.names, joints), ("cameras", options.cameras, cameras)):
+    streams = [stream.name for stream in robot_type.streams]
+    named: tuple[tuple[str, Mapping[str, object], list[str]], ...] = (
+        ("names", options.names, joints),
+        ("cameras", options.cameras, cameras),
+        ("scans", options.scans, streams),
+    )
+    for option, used, known in named:
         unknown = sorted(set(used) - set(known))
         if unknown:
             valid = ", ".join(known) or "none"
@@ -137,24 +148,34 @@ def _check(options: Options, robot_type: RobotType) -> None:
     names = [options.names.get(joint, joint) for joint in joints]
     if len(set(names)) != len(names):
         raise DriverError("option 'names': two joints have the same name in ROS")
-    _check_command(options, robot_type, names)
-    if options.connection == "rospy" and options.ros != 1:
-        raise DriverError("option 'connection': use \"rosbridge\" with ROS 2")
+    _check_joints(options.controllers, names)
+    for command in options.controllers:
+        _check_rate(command, robot_type)
+    if options.contradiction:
+        raise DriverError(options.contradiction)
     if (options.base is None) != (robot_type.base is None):
         raise DriverError(f"option 'base' is for robot types with a base; '{robot_type.type}' and the options differ")
 
 
-def _check_command(options: Options, robot_type: RobotType, names: Sequence[str]) -> None:
-    command = options.command
-    if command.kind == "positions":
-        if sorted(command.joints) != sorted(names):
+def _check_joints(controllers: Sequence[Command], names: Sequence[str]) -> None:
+    for command in controllers:
+        if not command.joints and (command.kind == "positions" or len(controllers) > 1):
             raise DriverError(
-                f"option 'command.joints' must list the joints in the controller's order: {', '.join(names)}"
+                f"option 'command.joints' must list the joints of {command.topic} in the controller's order; "
+                f"joints: {', '.join(names)}"
             )
-    elif command.joints:
-        raise DriverError("option 'command.joints' is only for kind = \"positions\"; other messages contain the names")
-    if command.kind == "goal" and options.ros != 1:
-        raise DriverError("option 'command.kind': use \"trajectory\" with ROS 2; its controllers take it on a topic")
+    listed = [name for command in controllers for name in command.joints or names]
+    if sorted(listed) != sorted(names):
+        wrong = sorted({name for name in names if listed.count(name) != 1} | (set(listed) - set(names)))
+        raise DriverError(
+            f"option 'command.joints': each joint must be listed once, by its name in ROS; check {', '.join(wrong)}"
+        )
+    topics = [command.topic.rstrip("/") for command in controllers]
+    if len(set(topics)) != len(topics):
+        raise DriverError("option 'command': two controllers have the same topic")
+
+
+def _check_rate(command: Command, robot_type: RobotType) -> None:
     if command.horizon_ms < 2 * max(robot_type.period_ms, 1000 / command.rate_hz):
         raise DriverError(
             "option 'command.horizon_ms' must be at least two command intervals: "

@@ -1,64 +1,53 @@
-"""Pictures from ``CompressedImage`` messages."""
+"""The newest picture of each camera."""
 
-import struct
 from collections.abc import Mapping
 
-from device_agent.drivers.ros.messages import CompressedImage
+from device_agent.middleware.ros import images
+from device_agent.middleware.ros.images import RawImage
+from device_agent.middleware.ros.messages import CompressedImage
 from device_agent.ports.driver import DriverError
-from device_agent.ports.sensor import Frame
-
-_START = b"\xff\xd8"
-_MARKER = 0xFF
-_STANDALONE = {0x01, *range(0xD0, 0xDA)}
-_SIZED = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""Markers that start a frame."""
+from device_agent.ports.sensor import Bytes, Frame
 
 
 class Pictures:
     """The newest picture of each camera. Written by one thread, read by any.
 
     Args:
-        cameras: Camera of the robot type → topic.
+        cameras: Cameras that have a topic.
     """
 
-    def __init__(self, cameras: Mapping[str, str]) -> None:
+    def __init__(self, cameras: Mapping[str, object]) -> None:
         self._cameras = cameras
-        self._newest: dict[str, Frame] = {}
+        self._newest: dict[str, tuple[Frame | Bytes, float]] = {}
 
     def accept(self, camera: str, message: CompressedImage, at_s: float) -> None:
-        """Use a picture that arrived at ``at_s`` [s].
+        """Use a JPEG that arrived at ``at_s`` [s].
 
         Raises:
             ValueError: It is no JPEG.
         """
-        width, height = jpeg_size(message.data)
-        self._newest[camera] = Frame(width, height, message.data, at_s)
+        width, height = images.jpeg_size(message.data)
+        self._newest[camera] = Frame(width, height, message.data, at_s), at_s
+
+    def accept_raw(self, camera: str, message: RawImage, at_s: float) -> None:
+        """Use a raw picture that arrived at ``at_s`` [s].
+
+        Raises:
+            ValueError: Its encoding is not supported, or its data have another size.
+        """
+        is_depth = images.is_depth(message)
+        self._newest[camera] = images.displayed(images.depths(message)) if is_depth else images.colours(message), at_s
 
     def take(self, camera: str) -> Frame | None:
-        """The newest picture, once; ``None`` if there is no new one.
+        """The newest picture, once; ``None`` if there is no new one. Raw pictures become JPEGs here.
 
         Raises:
             DriverError: The camera has no topic.
         """
         if camera not in self._cameras:
             raise DriverError(f"option 'cameras' names no topic for '{camera}'")
-        return self._newest.pop(camera, None)
-
-
-def jpeg_size(data: bytes) -> tuple[int, int]:
-    """Width and height of a JPEG [pixels].
-
-    Raises:
-        ValueError: It is no JPEG.
-    """
-    position = len(_START)
-    while data.startswith(_START) and position + 9 <= len(data) and data[position] == _MARKER:
-        marker = data[position + 1]
-        if marker in _STANDALONE:
-            position += 2
-            continue
-        length, _, height, width = struct.unpack_from(">HBHH", data, position + 2)
-        if marker in _SIZED:
-            return width, height
-        position += 2 + length
-    raise ValueError("a picture is no JPEG")
+        newest, at_s = self._newest.pop(camera, (None, 0.0))
+        if newest is None or isinstance(newest, Frame):
+            return newest
+        width, height, content = images.to_jpeg(newest)
+        return Frame(width, height, content, at_s)

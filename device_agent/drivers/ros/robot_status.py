@@ -6,15 +6,15 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from device_agent.drivers.ros import messages
 from device_agent.drivers.ros.options import Options, Safety
 from device_agent.drivers.ros.transforms import TransformTree
+from device_agent.middleware.ros import messages, scans
 from device_agent.ports.driver import DriverFault
 
 _ERROR = 2
 _CHARGING = 1
 _STALE_S = 1.0
-"""An older pose of the base is not reported [s]."""
+"""An older pose of the base, or an older scan, is not reported [s]."""
 _MAX_SHOWN = 3
 _MAX_ERRORS = 50
 
@@ -35,6 +35,7 @@ class RobotStatus:
         self._battery: Mapping[str, float | bool] = {}
         self._odometry: Mapping[str, float] = {}
         self._odometry_s = -math.inf
+        self._scans: dict[str, tuple[Mapping[str, float], float]] = {}
         self.transforms = TransformTree()
 
     # ------------------------------------------------------------ received
@@ -81,6 +82,14 @@ class RobotStatus:
         }
         self._odometry_s = at_s
 
+    def accept_scan(self, stream: str, message: scans.LaserScan, at_s: float) -> None:
+        """Use a scan.
+
+        Raises:
+            ValueError: It is invalid.
+        """
+        self._scans = {**self._scans, stream: (scans.sectors(message), at_s)}
+
     # ------------------------------------------------------------ read
 
     @property
@@ -107,10 +116,14 @@ class RobotStatus:
         return tuple(faults)
 
     def report(self, stream: str) -> Mapping[str, float | bool]:
-        """Values of the streams ``health`` and ``odometry``."""
+        """Values of the streams ``health`` and ``odometry``, and of scans."""
         if stream == "health":
             return self._battery
-        return self._pose(time.monotonic() - _STALE_S) if stream == "odometry" else {}
+        newer_than_s = time.monotonic() - _STALE_S
+        if stream in self._scans:
+            values, at_s = self._scans[stream]
+            return values if at_s > newer_than_s else {}
+        return self._pose(newer_than_s) if stream == "odometry" else {}
 
     def _pose(self, newer_than_s: float) -> Mapping[str, float]:
         odometry = self._odometry if self._odometry_s > newer_than_s else {}

@@ -2,7 +2,7 @@
 
 import math
 
-from device_agent.drivers.ros.messages import Quaternion, Transform, Transforms, Vector3
+from device_agent.middleware.ros.messages import Quaternion, Transform, Transforms, Vector3
 
 _MAX_DEPTH = 32
 

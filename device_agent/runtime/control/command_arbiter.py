@@ -54,7 +54,9 @@ class CommandArbiter:
         self._driver_limits: tuple[str, ...] = ()
         self._base_limits: tuple[str, ...] = ()
 
-    def update(self, now_s: float, measured_rad: Sequence[float] | None, elapsed_s: float | None) -> ControlOutput:
+    def update(
+        self, now_s: float, measured_rad: Sequence[float] | None, elapsed_s: float | None, *, settled: bool
+    ) -> ControlOutput:
         """Compute the command of this period; see ``Controller.update``."""
         state = self._state
         if measured_rad is not None:
@@ -73,7 +75,7 @@ class CommandArbiter:
             state.mode = Mode.HOLDING
             state.goals.abort()
         limited = self._limited()
-        state.goals.finish(limited, measured_rad=measured_rad, soft=state.stiffness.soft)
+        state.goals.finish(limited, measured_rad=measured_rad, soft=state.stiffness.soft, settled=settled)
         lease = state.authority.lease(now_s)
         return ControlOutput(
             list(state.motion.position_rad),

@@ -217,7 +217,9 @@ class ControlLoop:
             self._check_interlocks(now_s)
             self._update_device_stop(observation)
             elapsed_s = self._elapsed_s(now_s) if early and self._controller.moving else None
-            output = self._controller.update(now_s, observation.position_rad, elapsed_s=elapsed_s)
+            output = self._controller.update(
+                now_s, observation.position_rad, elapsed_s=elapsed_s, settled=observation.settled
+            )
             applied = observation.position_rad if self._device_stopped else self._command(output)
             self._controller.record_period(output)
             self._publish_telemetry(now_s, observation, output, applied)

@@ -364,7 +364,12 @@ class Controller:
             self._state.stream.reset(position_rad)
 
     def update(
-        self, now_s: float, measured_rad: Sequence[float] | None = None, *, elapsed_s: float | None = None
+        self,
+        now_s: float,
+        measured_rad: Sequence[float] | None = None,
+        *,
+        elapsed_s: float | None = None,
+        settled: bool = True,
     ) -> ControlOutput:
         """Compute the command of this period.
 
@@ -372,9 +377,10 @@ class Controller:
             now_s: Monotonic clock [s].
             measured_rad: Measured positions, shape (n,). Compliant joints are commanded there; goals wait for them.
             elapsed_s: Time since the last period began if a Stop makes this one early [s].
+            settled: Whether the device has reported the end of the previous command; goals wait for it.
         """
         with self._lock:
-            return self._arbiter.update(now_s, measured_rad, elapsed_s)
+            return self._arbiter.update(now_s, measured_rad, elapsed_s, settled=settled)
 
     def record_period(self, output: ControlOutput) -> None:
         """Record that the device has accepted all commands of this period. Only the control loop calls this."""

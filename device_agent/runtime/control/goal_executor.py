@@ -113,13 +113,16 @@ class GoalExecutor:
         if self.base is not None:
             self.base.update(elapsed_s)
 
-    def finish(self, limited: tuple[str, ...], *, measured_rad: Sequence[float] | None, soft: Collection[int]) -> None:
+    def finish(
+        self, limited: tuple[str, ...], *, measured_rad: Sequence[float] | None, soft: Collection[int], settled: bool
+    ) -> None:
         """End the goal if it has been reached.
 
         Args:
             limited: Limits that apply in this period.
             measured_rad: Measured positions, shape (n,); ``None``: trust the commanded ones.
             soft: Joints with reduced stiffness.
+            settled: Whether the device has reported the end of the previous command.
         """
         goal = self.goal
         if goal is None:
@@ -129,7 +132,7 @@ class GoalExecutor:
             done = (
                 goal.periods <= 0 and not self.moving
                 if isinstance(goal, DriveGoal)
-                else self._is_reached(measured_rad, soft)
+                else self._is_reached(measured_rad, soft) and settled
             )
         except Refused as refused:
             self.interrupt(refused)

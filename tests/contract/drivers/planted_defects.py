@@ -10,12 +10,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
+import pytest
+
+from device_agent.drivers.ros.joint_commands import JointCommands
 from device_agent.drivers.testing.template.base_driver import TemplateBaseDriver
 from device_agent.drivers.testing.template.connection import Measurement
 from device_agent.drivers.testing.template.driver import TemplateDriver
 from device_agent.drivers.testing.template.test_driver import TestTemplateDriver as TemplateContract
 from device_agent.ports.driver import DriverFault, Observation, UnreachableError
 from device_agent.ports.threads import SupervisedThread
+from tests.contract.drivers.ros.test_contract import TestRos1Arm as RosContract
 
 
 def assert_never_set(event: threading.Event) -> None:
@@ -230,3 +234,19 @@ class TestNoReconnection(Planted):
 class TestRawError(Planted):
     driver_class = RawError
     caught_by = "test_a_missing_device_is_described_and_reported"
+
+
+class TestLongerTrajectory(RosContract):
+    """Each trajectory of the driver for ROS is longer by 0.5 s."""
+
+    deadline_s = 3.0
+    caught_by = "test_a_motion_ends_in_time_after_a_cut"
+
+    @pytest.fixture(autouse=True)
+    def _plant(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        request = JointCommands._request
+
+        def longer(self: JointCommands, position_rad: Any, duration_s: float, **more: Any) -> Any:
+            return request(self, position_rad, duration_s + 0.5, **more)
+
+        monkeypatch.setattr(JointCommands, "_request", longer)

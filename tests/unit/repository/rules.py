@@ -16,6 +16,7 @@ SOURCES: Final = frozenset({".py", ".ts", ".tsx", ".css", ".mjs", ".cjs", ".lua"
 TEXTS: Final = SOURCES | {".md", ".toml", ".html", ".yml", ".service"}
 WIDE_FOLDERS: Final = {
     ".": "files that a Functions host, package tools and repository hosts expect in the root",
+    "device_agent": "one package for each layer and capability of the agent",
     "docs/decisions": "numbered decision records, one file each",
     "docs/pictures": "screenshots that the browser tests write",
 }

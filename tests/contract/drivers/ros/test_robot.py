@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from device_agent.drivers.ros import RosBaseDriver, RosDriver
-from device_agent.drivers.ros.joint_commands import Publication
 from device_agent.drivers.testing.peer import Disturbance
+from device_agent.middleware.ros.connection import Publication
 from device_agent.ports.driver import DriverError, Twist, UnreachableError
 from tests.harness.robots.ros import robot as topics
 from tests.harness.robots.ros.peer import RosPeer
@@ -162,11 +162,6 @@ def test_measurements_that_arrive_late_are_rejected(peer: RosPeer) -> None:
 @pytest.mark.parametrize("ros", [1, 2])
 def test_each_kind_of_command_moves_the_arm(kind: str, ros: int) -> None:
     peer = RosPeer(TYPE, ros=ros, kind=kind)
-    if (kind, ros) == ("goal", 2):
-        with pytest.raises(DriverError, match='use "trajectory" with ROS 2'):
-            create(peer)
-        peer.close()
-        return
     driver = create(peer)
     driver.connect()
     target = [value + 0.03 * (index + 1) for index, value in enumerate(HOME)]
@@ -230,11 +225,11 @@ def test_halting_brakes_also_for_delayed_commands(driver: RosDriver, peer: RosPe
         publish(publication)
 
     def halted_meanwhile(publication: Any) -> None:
-        connection.publish = brake  # type: ignore[method-assign]
+        connection.publish = brake  # type: ignore[method-assign, assignment]
         driver.halt()  # of the supervisor, while this thread sends
         publish(publication)
 
-    connection.publish = halted_meanwhile  # type: ignore[method-assign]
+    connection.publish = halted_meanwhile  # type: ignore[method-assign, assignment]
     halted_s = peer.robot.joints.time_s
     with pytest.raises(DriverError, match="was halted"):
         until(lambda: not driver.send(target))

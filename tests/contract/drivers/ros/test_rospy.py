@@ -12,10 +12,9 @@ import pytest
 
 from device_agent import drivers
 from device_agent.drivers.ros import RosDriver
-from device_agent.drivers.ros.connection import Connection, Subscription
-from device_agent.drivers.ros.joint_commands import Publication
-from device_agent.drivers.ros.messages import Twist
-from device_agent.drivers.ros.rospy_channel import RospyChannel
+from device_agent.middleware.ros.connection import Connection, Publication, Subscription
+from device_agent.middleware.ros.messages import Twist
+from device_agent.middleware.ros.rospy_channel import RospyChannel
 from device_agent.ports.driver import DriverError, UnreachableError
 from device_agent.protocol.manifests import robot_type as robot_types
 from tests.harness.paths import UR5

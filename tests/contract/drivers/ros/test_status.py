@@ -10,13 +10,16 @@ import simplejpeg
 
 from device_agent import drivers
 from device_agent.drivers.ros import RosBaseDriver, RosDriver
-from device_agent.drivers.ros.pictures import jpeg_size
 from device_agent.drivers.testing.peer import Disturbance
+from device_agent.middleware.ros.images import jpeg_size
 from device_agent.ports.driver import DriverError, Twist, UnreachableError
-from tests.harness.paths import UR5
+from tests.harness.paths import ROBOTS, UR5
 from tests.harness.robots.ros import robot as topics
 from tests.harness.robots.ros.peer import RosPeer
-from tests.harness.robots.ros.steps import HOME, TYPE, until
+from tests.harness.robots.ros.sensors import COLOURS, DEPTHS_MM, MESSAGES, as_json, image
+from tests.harness.robots.ros.steps import HOME, QBO, TYPE, until
+
+NAMES = [joint.name for joint in TYPE.joints]
 
 # ------------------------------------------------------------ safety and status
 
@@ -105,6 +108,39 @@ def test_pictures_are_camera_frames(mobile: tuple[RosBaseDriver, RosPeer]) -> No
         driver.frame("chest")
 
 
+@pytest.mark.parametrize("picture", [image(COLOURS, "bgr8"), image(DEPTHS_MM, "16UC1")], ids=["bgr8", "16UC1"])
+def test_raw_pictures_are_frames_and_scans_are_streams(picture: dict[str, Any]) -> None:
+    peer = RosPeer(QBO)
+    raw, scan = as_json(picture), as_json(MESSAGES["/scan"][1])
+
+    def offer(robot: Any, server: Any) -> None:
+        server.types = {**server.types, "/image": "sensor_msgs/Image", "/scan": "sensor_msgs/LaserScan"}
+        step = robot.step
+
+        def publish() -> None:
+            step()
+            server.publish("/image", raw)
+            server.publish("/scan", scan)
+
+        robot.step = publish
+
+    peer.change(offer)
+    sonar = "sonar"
+    options = {**peer.options(), "cameras": {"eyes": {"raw": "/image"}}, "scans": {sonar: "/scan"}}
+    driver = drivers.load("ros")(QBO, ROBOTS / "qbo", options, "qbo")
+    assert isinstance(driver, RosBaseDriver)
+    driver.connect()
+    frames: list[Any] = []
+    until(lambda: frames.append(driver.frame("eyes")) or frames[-1] is not None)  # type: ignore[func-returns-value]
+    assert (frames[-1].width, frames[-1].height) == (64, 48)
+    assert simplejpeg.decode_jpeg(frames[-1].content).shape == (48, 64, 3)
+    until(lambda: driver.report(sonar).get("range_m.1") == pytest.approx(1.41))
+    peer.disturb(Disturbance.CONNECTION)
+    until(lambda: driver.report(sonar) == {})
+    driver.close()
+    peer.close()
+
+
 @pytest.mark.parametrize("cut", [0, 1, 2, 10, 150])
 def test_other_data_are_no_picture(cut: int) -> None:
     picture = simplejpeg.encode_jpeg(np.zeros((120, 160, 3), np.uint8))
@@ -121,7 +157,7 @@ def test_other_data_are_no_picture(cut: int) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"speed": 1}, "driver 'ros' has no option 'speed'; it has: connection, address, master"),
+        ({"speed": 1}, "driver 'ros' has no option 'speed'; it has: connection, address, certificate_authority"),
         ({"command": {}}, r"missing required field `topic` - at `\$.command`"),
         ({"command": {"topic": "/c", "speed": 1}}, r"unknown field `speed` - at `\$.command`"),
         ({"connection": "rospy", "ros": 2}, 'use "rosbridge" with ROS 2'),
@@ -131,8 +167,14 @@ def test_other_data_are_no_picture(cut: int) -> None:
         ({"names": {"thumb": "thumb_joint"}}, "robot type 'ur5' has no 'thumb'; it has: shoulder_pan"),
         ({"cameras": {"eye": "/camera"}}, "option 'cameras': robot type 'ur5' has no 'eye'; it has: none"),
         ({"names": {"elbow": "wrist_1"}}, "two joints have the same name"),
-        ({"command": {"topic": "/c", "kind": "positions"}}, "must list the joints in the controller's order"),
-        ({"command": {"topic": "/c", "joints": ["elbow"]}}, "only for kind"),
+        ({"command": {"topic": "/c", "kind": "positions"}}, "must list the joints of /c in the controller's order"),
+        ({"command": {"topic": "/c", "joints": ["elbow"]}}, "each joint must be listed once, .* check shoulder_lift"),
+        ({"command": [{"topic": "/c"}, {"topic": "/d"}]}, "must list the joints of /c"),
+        ({"command": [{"topic": "/c", "joints": ["elbow"]}, {"topic": "/d", "joints": ["elbow"]}]}, "check elbow"),
+        ({"command": [{"topic": "/c", "joints": ["thumb"]}]}, "check .*thumb"),
+        ({"command": [{"topic": "/c", "joints": NAMES[:3]}, {"topic": "/c/", "joints": NAMES[3:]}]}, "the same topic"),
+        ({"certificate_authority": "ca.pem"}, "needs an address with wss://"),
+        ({"scans": {"lidar": "/scan"}}, "option 'scans': robot type 'ur5' has no 'lidar'"),
         ({"command": {"topic": "/c", "rate_hz": 10}}, "at least two command intervals"),
         ({"base": {"cmd_vel": "/cmd_vel"}}, "option 'base'"),
     ],

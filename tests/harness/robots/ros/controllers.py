@@ -45,10 +45,13 @@ class JointController:
 
     Attributes:
         position: True positions by name [rad]; ``velocity`` [rad/s].
+        goal: Positions at the end of the newest trajectory [rad]; ``end_s``: when it ends, on the robot's clock [s].
     """
 
     def __init__(self, position_rad: Mapping[str, float]) -> None:
         self.names = tuple(position_rad)
+        self.end_s = 0.0
+        self.goal: dict[str, float] = {}
         self.position = dict(position_rad)
         self.velocity = dict.fromkeys(self.names, 0.0)
         self.time_s = 0.0
@@ -61,14 +64,14 @@ class JointController:
         """Whether no joint moves."""
         return all(abs(value) < 1e-3 for value in self.velocity.values())
 
-    def follow(self, trajectory: Mapping[str, Any]) -> None:
-        """Replace the trajectory.
+    def follow(self, trajectory: Mapping[str, Any], joints: Sequence[str] = ()) -> None:
+        """Replace the trajectory of all joints, or of those of one of several controllers.
 
         Raises:
             RejectedError: It is invalid.
         """
         names, points = trajectory["joint_names"], trajectory["points"]
-        if sorted(names) != sorted(self.names) or not points:
+        if sorted(names) != sorted(joints or self.names) or not points:
             raise RejectedError(f"joints {names} for the controller of {list(self.names)}")
         end_s = 0.0
         states = [(0.0, [self._desired[name] for name in names])]
@@ -86,6 +89,7 @@ class JointController:
                 for (p, v), (q, w) in [(before[index], after[index])]
             ]
         self._targets = {}
+        self.goal, self.end_s = dict(zip(names, points[-1]["positions"], strict=True)), self.time_s + end_s
 
     def approach(self, names: Sequence[str], target_rad: Sequence[float]) -> None:
         """Follow a target as fast as the motors can.
@@ -127,6 +131,75 @@ class JointController:
         wanted = min(max(wanted, -_MAX_VELOCITY_RAD_S), _MAX_VELOCITY_RAD_S)
         change = _MAX_ACCELERATION_RAD_S2 * CYCLE_S
         return self.velocity[name] + min(max(wanted - self.velocity[name], -change), change)
+
+
+class TrajectoryAction:
+    """Action FollowJointTrajectory of ``joint_trajectory_controller``: a new goal replaces the previous one.
+
+    Args:
+        joints: The controller.
+
+    Attributes:
+        ended: Goals that have ended since the last look: goal, outcome, error code and text. An outcome is
+            ``succeeded``, ``preempted``, ``aborted`` or ``rejected``.
+        newest: The goal that was accepted last.
+        enabled: Whether the controller runs. Otherwise it rejects goals.
+        silent: Whether it reports no results.
+        cancelled: Number of goals that were cancelled.
+        succeeded: Number of goals that were completed.
+    """
+
+    def __init__(self, joints: JointController) -> None:
+        self._joints = joints
+        self._goal: Any = None
+        self.newest: Any = None
+        self.enabled = True
+        self.silent = False
+        self.cancelled = self.succeeded = 0
+        self.ended: list[tuple[Any, str, int, str]] = []
+
+    def start(self, goal: Any, trajectory: Mapping[str, Any]) -> bool:
+        """Start a goal, unless it is invalid. Returns whether it was accepted."""
+        if not self.enabled:
+            self._end(goal, "rejected", -1, "the controller is not running")
+            return False
+        try:
+            self._joints.follow(trajectory)
+        except RejectedError as error:
+            self._end(goal, "rejected", -1, str(error))
+            return False
+        if self._goal is not None:
+            self._end(self._goal, "preempted", -1, "a new goal has arrived")
+        self._goal = self.newest = goal
+        return True
+
+    def cancel(self, goal: Any) -> None:
+        """Stop, if this is the present goal."""
+        if goal is not None and goal == self._goal:
+            self.cancelled += 1
+            self._joints.stop()
+            self._end(goal, "preempted", 0, "")
+
+    def abort(self, code: int, text: str) -> None:
+        """Stop, and end the present goal as failed."""
+        self._joints.stop()
+        if self._goal is not None:
+            self._end(self._goal, "aborted", code, text)
+
+    def step(self) -> None:
+        """End the goal when the joints have arrived. Call it after each cycle of the joints."""
+        joints = self._joints
+        if self._goal is None or joints.time_s < joints.end_s or not joints.at_rest:
+            return
+        if all(abs(joints.position[name] - value) < 0.01 for name, value in joints.goal.items()):
+            self.succeeded += 1
+            self._end(self._goal, "succeeded", 0, "")
+
+    def _end(self, goal: Any, outcome: str, code: int, text: str) -> None:
+        if goal == self._goal:
+            self._goal = None
+        if not self.silent:
+            self.ended.append((goal, outcome, code, text))
 
 
 class BaseController:

@@ -9,6 +9,7 @@ _PRIMITIVES: Mapping[str, type | tuple[type, ...]] = {
 }  # fmt: skip
 _DEFINITIONS: Mapping[str, Mapping[str, str]] = {
     "std_msgs/Header": {"stamp": "time", "frame_id": "string"},
+    "std_msgs/String": {"data": "string"},
     "std_msgs/Float64MultiArray": {"layout": "std_msgs/MultiArrayLayout", "data": "float64[]"},
     "std_msgs/MultiArrayLayout": {"dim": "std_msgs/MultiArrayDimension[]", "data_offset": "uint32"},
     "sensor_msgs/JointState": {

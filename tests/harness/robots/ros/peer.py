@@ -29,13 +29,24 @@ class RosPeer:
         ros: Version of ROS.
         kind: Kind of the command topic, as in the driver's options.
         stamped: Whether the velocity of the base is a TwistStamped.
+        split: Whether the joints have two controllers.
     """
 
-    def __init__(self, robot_type: RobotType, *, ros: int = 1, kind: str = "trajectory", stamped: bool = False) -> None:
+    def __init__(
+        self,
+        robot_type: RobotType,
+        *,
+        ros: int = 1,
+        kind: str = "trajectory",
+        stamped: bool = False,
+        split: bool = False,
+    ) -> None:
+        self._split = split
         self._type, self._ros, self._kind, self._stamped = robot_type, ros, kind, stamped
         self._lock = threading.Lock()
-        self.robot = Robot(robot_type, ros=ros, kind=kind, stamped=stamped)
-        self.server = RosbridgeServer(self.robot.types(), self._receive, ros)
+        self.robot = Robot(robot_type, ros=ros, kind=kind, stamped=stamped, split=split)
+        self.server = RosbridgeServer(self.robot.types(), self._receive, ros, self._receive_goal)
+        self.server.actions[topics.ACTION] = "control_msgs/action/FollowJointTrajectory"
         self.server.latched[topics.SAFETY] = {"data": False}
         self._disturbance: Disturbance | None = None
         self._old_ns = 0
@@ -51,11 +62,13 @@ class RosPeer:
             command |= {"topic": topics.ACTION, "rate_hz": 20}
         if self._kind == "positions":
             command["joints"] = self.robot.names[::-1]
+        arm = {**command, "joints": self.robot.names[:3]}
+        wrist = {"topic": topics.WRIST, "joints": self.robot.names[3:]}
         options: dict[str, object] = {
             "address": f"127.0.0.1:{self.server.port}",
             "ros": self._ros,
             "names": {joint.name: f"{joint.name}_joint" for joint in self._type.joints},
-            "command": command,
+            "command": [arm, wrist] if self._split else command,
             "battery": topics.BATTERY,
             "diagnostics": topics.DIAGNOSTICS,
             "stopping_diagnostics": ["arm"],
@@ -113,7 +126,7 @@ class RosPeer:
                 self.server.restart()
             self._disturbance = None
             if self.robot.stopped:
-                self.robot.stopped = False
+                self.robot.release()
                 self._publish_safety()
 
     def change(self, change: Callable[[Robot, RosbridgeServer], None]) -> None:
@@ -143,6 +156,12 @@ class RosPeer:
         except RejectedError as error:
             self.robot.rejected.append(str(error))
 
+    def _receive_goal(self, number: str, goal: Any) -> None:
+        if goal is None:
+            self.robot.action.cancel(number)
+        else:
+            self.robot.start_goal(number, goal)
+
     def _publish_safety(self) -> None:
         self.server.latched[topics.SAFETY] = {"data": self.robot.stopped}
         self.server.publish(topics.SAFETY, {"data": self.robot.stopped})
@@ -163,8 +182,14 @@ class RosPeer:
         if kind is Disturbance.NAN:
             message["position"] = [float("nan")] * len(message["position"])
         self.server.publish(topics.JOINT_STATES, message, self._corrupt)
+        for result in robot.results():
+            if self._ros == 1:
+                self.server.publish(f"{topics.ACTION}/result", result, self._corrupt)
+            else:
+                self.server.send_result(result)
         if self._cycles % _SLOW:
             return
+        self.server.publish(f"{topics.ACTION}/status", robot.status(), self._corrupt)
         self.server.publish(topics.DIAGNOSTICS, robot.diagnostics(), self._corrupt)
         self.server.publish(topics.BATTERY, robot.battery(), self._corrupt)
         self.server.publish(topics.ODOMETRY, robot.odometry(), self._corrupt)

@@ -10,12 +10,14 @@ import numpy as np
 import simplejpeg
 
 from device_agent.protocol.manifests.robot_type import RobotType
-from tests.harness.robots.ros.controllers import BaseController, JointController
+from tests.harness.robots.ros.controllers import BaseController, JointController, TrajectoryAction
 
 JOINT_STATES, SAFETY, DIAGNOSTICS, BATTERY = "/joint_states", "/emergency_stop", "/diagnostics", "/battery"
 CMD_VEL, ODOMETRY, TF = "/cmd_vel", "/odom", "/tf"
 PICTURES = "/camera/image_raw/compressed"
 COMMAND = "/arm_controller/command"
+WRIST = "/wrist_controller/command"
+"""Topic of the last three joints, if there are two controllers."""
 ACTION = "/arm_controller/follow_joint_trajectory"
 _PICTURE = simplejpeg.encode_jpeg(np.full((120, 160, 3), 128, np.uint8))
 _COMMANDS = {
@@ -24,6 +26,8 @@ _COMMANDS = {
     "joint_state": (COMMAND, "sensor_msgs/JointState"),
     "goal": (f"{ACTION}/goal", "control_msgs/FollowJointTrajectoryActionGoal"),
 }
+_ROS1 = {"succeeded": 3, "preempted": 2, "aborted": 4, "rejected": 5}
+_ROS2 = {"succeeded": 4, "preempted": 5, "aborted": 6}
 
 
 class Robot:
@@ -34,11 +38,13 @@ class Robot:
         rejected: Commands that a controller did not accept.
     """
 
-    def __init__(self, robot_type: RobotType, *, ros: int, kind: str, stamped: bool) -> None:
+    def __init__(self, robot_type: RobotType, *, ros: int, kind: str, stamped: bool, split: bool) -> None:
+        self._split = split
         self._ros, self._kind, self._stamped = ros, kind, stamped
         self.names = [f"{joint.name}_joint" for joint in robot_type.joints]
         home = [robot_type.home_rad[joint.name] for joint in robot_type.joints]
         self.joints = JointController(dict(zip(self.names, home, strict=True)))
+        self.action = TrajectoryAction(self.joints)
         self.base = BaseController()
         self.stopped = False
         self.rejected: list[str] = []
@@ -62,6 +68,10 @@ class Robot:
             PICTURES: "sensor_msgs/CompressedImage",
             CMD_VEL: "geometry_msgs/TwistStamped" if self._stamped else "geometry_msgs/Twist",
             self.command_topic: _COMMANDS[self._kind][1],
+            WRIST: "trajectory_msgs/JointTrajectory",
+            f"{ACTION}/cancel": "actionlib_msgs/GoalID",
+            f"{ACTION}/result": "control_msgs/FollowJointTrajectoryActionResult",
+            f"{ACTION}/status": "actionlib_msgs/GoalStatusArray",
         }
         return known if self._ros == 1 else {topic: kind.replace("/", "/msg/") for topic, kind in known.items()}
 
@@ -72,6 +82,12 @@ class Robot:
             RejectedError: The controller does not accept it.
         """
         self.commands += 1
+        if topic == f"{ACTION}/cancel":
+            self.action.cancel(message["id"])
+            return
+        if self._kind == "goal" and topic != CMD_VEL:
+            self.action.start(message["goal_id"]["id"], message["goal"]["trajectory"])
+            return
         if self.stopped:
             return
         if topic == CMD_VEL:
@@ -81,17 +97,34 @@ class Robot:
         elif self._kind == "joint_state":
             self.joints.approach(message["name"], message["position"])
         else:
-            self.joints.follow(message["goal"]["trajectory"] if self._kind == "goal" else message)
+            self.joints.follow(message, self.controlled(topic))
+
+    def controlled(self, topic: str) -> list[str]:
+        """Joints of the controller with this topic."""
+        if not self._split:
+            return self.names
+        return self.names[3:] if topic == WRIST else self.names[:3]
+
+    def start_goal(self, number: str, goal: Mapping[str, Any]) -> None:
+        """Execute a goal of ROS 2."""
+        self.commands += 1
+        self.action.start(number, goal["trajectory"])
 
     def stop(self) -> None:
         """Stop itself until ``release``."""
-        self.stopped = True
+        self.stopped, self.action.enabled = True, False
+        self.action.abort(0, "emergency stop")
         self.joints.stop()
         self.base.stop()
+
+    def release(self) -> None:
+        """End of ``stop``."""
+        self.stopped, self.action.enabled = False, True
 
     def step(self) -> None:
         """One cycle."""
         self.joints.step()
+        self.action.step()
         self.base.step()
 
     # ------------------------------------------------------------ messages
@@ -138,6 +171,30 @@ class Robot:
                 {"header": {"frame_id": "odom"}, "child_frame_id": "base_link", "transform": in_odometry},
             ]
         }
+
+    def status(self) -> dict[str, Any]:
+        """Status of the action server of ROS 1."""
+        return {"header": {"stamp": self.time(time.time_ns()), "frame_id": ""}, "status_list": []}
+
+    def results(self) -> list[dict[str, Any]]:
+        """Results of the goals that have ended, for ROS 1; for ROS 2 without ``op``."""
+        ended, self.action.ended = self.action.ended, []
+        results: list[dict[str, Any]] = []
+        for number, outcome, code, text in ended:
+            result = {"error_code": code, "error_string": text}
+            if self._ros == 1:
+                state: dict[str, Any] = {
+                    "goal_id": {"stamp": self.time(0), "id": number},
+                    "status": _ROS1[outcome],
+                    "text": text,
+                }
+                results.append({"status": state, "result": result})
+            elif outcome == "rejected":
+                results.append({"action": ACTION, "id": number, "values": text, "status": 0, "result": False})
+            else:
+                row = {"action": ACTION, "id": number, "values": result, "status": _ROS2[outcome], "result": True}
+                results.append(row)
+        return results
 
     def time(self, stamp_ns: int) -> dict[str, int]:
         """A time as a message."""

@@ -25,6 +25,9 @@ class RosSystem:
 
     Args:
         folder: For logs and bags.
+
+    Attributes:
+        messages: Folder with the Python package ``control_msgs``.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -40,7 +43,14 @@ class RosSystem:
             "ROS_LOG_DIR": str(folder / "log"),
         }
         self._processes: list[subprocess.Popen[str]] = []
+        self.messages = folder / "messages"
+        self.run(PYTHON, "-I", str(_FOLDER / "control_msgs.py"), str(self.messages))
         self.start_master()
+
+    @property
+    def port(self) -> int:
+        """Port of the master."""
+        return self._port
 
     def start_master(self) -> None:
         """Start ``roscore``, and wait until its parameter server answers."""
@@ -102,15 +112,20 @@ class RosRobot:
         home = [f"{joint.name}_joint={robot_type.home_rad[joint.name]}" for joint in robot_type.joints]
         self.names = [f"{joint.name}_joint" for joint in robot_type.joints]
         controllers, program = str(_FOLDER / "controllers.py"), str(_FOLDER / "rospy_robot.py")
-        self.process = system.start(PYTHON, "-I", program, controllers, *home, stdin=subprocess.PIPE)
+        folder = str(system.messages)
+        self.process = system.start(PYTHON, "-I", program, controllers, folder, *home, stdin=subprocess.PIPE)
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == "ready\n"
 
     def state(self) -> dict[str, Any]:
         """The true state."""
+        return self.request()
+
+    def request(self, **values: object) -> dict[str, Any]:
+        """Change the robot; see ``rospy_robot.py``. Returns the true state."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
-        self.process.stdin.write("\n")
+        self.process.stdin.write(json.dumps(values) + "\n")
         self.process.stdin.flush()
         state: dict[str, Any] = json.loads(self.process.stdout.readline())
         return state

@@ -15,6 +15,8 @@ from websockets.server import ServerProtocol
 from tests.harness.robots.ros import definitions
 
 Receive = Callable[[str, Mapping[str, Any]], None]
+ReceiveGoal = Callable[[str, Mapping[str, Any] | None], None]
+_GOAL = "control_msgs/FollowJointTrajectoryGoal"
 
 
 class RosbridgeServer:
@@ -24,20 +26,24 @@ class RosbridgeServer:
         types: Topic → type, of all topics that the robot publishes or subscribes to.
         receive: Called with each valid message that a client publishes.
         ros: Version of ROS.
+        receive_goal: Called with the id of a goal of ROS 2, and the goal; ``None``: it is cancelled.
 
     Attributes:
         latched: Topic → message that each new subscriber receives.
+        actions: Action → type, of the action servers of ROS 2.
         errors: Messages of the clients that were rejected.
     """
 
-    def __init__(self, types: Mapping[str, str], receive: Receive, ros: int) -> None:
+    def __init__(self, types: Mapping[str, str], receive: Receive, ros: int, receive_goal: ReceiveGoal) -> None:
         self.types = types
         self._receive = receive
         self._ros = ros
+        self._receive_goal = receive_goal
         self._clients: list[_Client] = []
         self._server = _listen(0)
         self.port: int = self._server.getsockname()[1]
         self.latched: dict[str, Any] = {}
+        self.actions: dict[str, str] = {}
         self.errors: list[str] = []
 
     def step(self) -> None:
@@ -67,6 +73,14 @@ class RosbridgeServer:
                 with contextlib.suppress(InvalidState):  # the client has closed it
                     client.send(data)
 
+    def send_result(self, result: Mapping[str, Any]) -> None:
+        """Send the end of a goal of ROS 2 to the client that has sent the goal."""
+        for client in self._clients:
+            if result["id"] in client.goals:
+                client.goals.discard(result["id"])
+                with contextlib.suppress(InvalidState):
+                    client.send(json.dumps({"op": "action_result", **result}).encode())
+
     def subscribers(self, topic: str) -> int:
         """Number of subscribers of a topic."""
         return sum(topic in client.subscribed for client in self._clients)
@@ -88,6 +102,9 @@ class RosbridgeServer:
         self._server = _listen(self.port)
 
     def _process(self, client: "_Client", message: Mapping[str, Any]) -> None:
+        if self._ros == 2 and message["op"] in {"send_action_goal", "cancel_action_goal"}:
+            self._process_goal(client, message)
+            return
         operation, topic = message["op"], message["topic"]
         if operation in {"advertise", "subscribe"} and message["type"] != self.types[topic]:
             raise definitions.FieldError(f"{topic} has the type {self.types[topic]}, not {message['type']}")
@@ -103,6 +120,22 @@ class RosbridgeServer:
         else:
             raise LookupError(f"{operation} {topic}")
 
+    def _process_goal(self, client: "_Client", message: Mapping[str, Any]) -> None:
+        number = message["id"]
+        if message["op"] == "cancel_action_goal":
+            if number in client.goals:
+                self._receive_goal(number, None)
+        elif message["action"] not in self.actions:
+            text = "no action server"
+            failed = {"action": message["action"], "id": number, "values": text, "status": 0, "result": False}
+            client.send(json.dumps({"op": "action_result", **failed}).encode())
+        elif message["action_type"] != self.actions[message["action"]]:
+            raise definitions.FieldError(f"{message['action']} has another type than {message['action_type']}")
+        else:
+            definitions.check(message["args"], _GOAL, self._ros)
+            client.goals.add(number)
+            self._receive_goal(number, message["args"])
+
 
 class _Client:
     def __init__(self, opened: socket.socket) -> None:
@@ -111,6 +144,7 @@ class _Client:
         self._protocol = ServerProtocol()
         self.subscribed: set[str] = set()
         self.advertised: set[str] = set()
+        self.goals: set[str] = set()
 
     def receive(self) -> list[bytes]:
         try:

@@ -63,6 +63,18 @@ def test_a_goal_ends_when_the_measured_joints_arrive(periods: int) -> None:
     assert rested_s < 0.4
 
 
+def test_a_goal_waits_until_the_device_reports_the_end() -> None:
+    fixture = ServoFixture(delayed(0))
+    move = fixture.move(elbow=1.0)
+    for _ in range(500):
+        fixture.now_s += PERIOD_S
+        fixture.controller.update(fixture.now_s, fixture.servo(fixture.controller.commanded_rad), settled=False)
+    assert fixture.controller.commanded_rad[1] == pytest.approx(1.0)
+    assert not move.finished.is_set()
+    fixture.finish(move)
+    assert move.result is GoalResult.REACHED
+
+
 def test_passing_through_is_not_arrival() -> None:
     swing = iter(range(10_000))
     fixture = ServoFixture(lambda at_rad: (at_rad[0], at_rad[1] + 0.2 * math.cos(next(swing) * PERIOD_S * 20)))

@@ -1,4 +1,4 @@
-"""A connection to ROS: topics that are received and published, as messages of the rosbridge protocol, version 2.
+"""A connection to ROS: topics and actions, as messages of the rosbridge protocol, version 2.
 
 A ``Channel`` transports the messages: ``rosbridge.py`` over a WebSocket to a rosbridge server, ``rospy_channel.py``
 over a socket to a bridge process.
@@ -7,12 +7,12 @@ over a socket to a bridge process.
 import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import msgspec
 
-from device_agent.drivers.ros.joint_commands import Publication
-from device_agent.drivers.ros.messages import Message
+from device_agent.middleware.ros.messages import Message
 from device_agent.ports.driver import UnreachableError
 from device_agent.ports.threads import SupervisedThread
 
@@ -50,6 +50,65 @@ class Channel(Protocol):
         """Free all resources, when no other thread uses the channel any more."""
 
 
+class Publication(NamedTuple):
+    """A message for a topic."""
+
+    topic: str
+    message: Message
+
+    @property
+    def request(self) -> Message:
+        """The message of the protocol."""
+        return {"op": "publish", "topic": self.topic, "msg": self.message}
+
+
+class ActionGoal(NamedTuple):
+    """A goal for an action server of ROS 2. In ROS 1 a goal is a message for a topic."""
+
+    action: str
+    type: str
+    id: str
+    message: Message
+
+    @property
+    def request(self) -> Message:
+        """The message of the protocol. Feedback is not requested, because measurements have a topic."""
+        names = {"id": self.id, "action": self.action, "action_type": self.type}
+        return {"op": "send_action_goal", **names, "args": self.message, "feedback": False}
+
+
+class ActionCancel(NamedTuple):
+    """The end of a goal in ROS 2."""
+
+    action: str
+    id: str
+
+    @property
+    def request(self) -> Message:
+        """The message of the protocol."""
+        return {"op": "cancel_action_goal", "id": self.id, "action": self.action}
+
+
+Command = Publication | ActionGoal | ActionCancel
+
+
+class ActionResult(msgspec.Struct, frozen=True):
+    """The end of a goal in ROS 2. ``result`` is false if the server is missing or has rejected the goal.
+
+    Attributes:
+        action: Name of the action.
+        id: Id of the goal.
+        status: ``action_msgs/GoalStatus``.
+        values: The result message; a text if ``result`` is false.
+    """
+
+    action: str
+    id: str
+    result: bool
+    status: int = 0
+    values: Any = None
+
+
 class Subscription(NamedTuple):
     """A topic to receive.
 
@@ -71,6 +130,7 @@ class Subscription(NamedTuple):
 class _Received(msgspec.Struct, frozen=True):
     op: str
     topic: str = ""
+    action: str = ""
     level: str = ""
     msg: msgspec.Raw = msgspec.Raw(b"null")
 
@@ -82,6 +142,7 @@ class Connection:
         channel: The connected channel.
         subscriptions: Topics to receive.
         advertised: Topics to publish, with their types.
+        results: Action → called with each result and its arrival [s]; only in ROS 2.
         device: Id of the device at its agent.
         clock: The monotonic clock [s].
 
@@ -100,7 +161,10 @@ class Connection:
         advertised: Mapping[str, str],
         device: str,
         clock: Callable[[], float],
+        results: Mapping[str, Callable[[ActionResult, float], None]] = MappingProxyType({}),
     ) -> None:
+        self._results = results
+        self._result_decoder = msgspec.json.Decoder(ActionResult)
         self._channel = channel
         self._clock = clock
         self._closed = threading.Event()
@@ -132,13 +196,13 @@ class Connection:
         """Whether the connection has ended."""
         return self._closed.is_set()
 
-    def publish(self, publication: Publication) -> None:
-        """Publish a message. Never blocks; any thread may call it.
+    def publish(self, command: Command) -> None:
+        """Publish a message, or send or cancel a goal. Never blocks; any thread may call it.
 
         Raises:
             UnreachableError: The connection has ended.
         """
-        self._send({"op": "publish", "topic": publication.topic, "msg": publication.message})
+        self._send(command.request)
 
     def close(self) -> None:
         """End the connection and its thread. May be called repeatedly."""
@@ -175,6 +239,9 @@ class Connection:
             received = self._decoder.decode(data)
             if received.op == "status":
                 self._report_status(received)
+            if received.op == "action_result" and received.action in self._results:
+                topic = received.action
+                self._results[topic](self._result_decoder.decode(data), at_s)
             if received.op != "publish":
                 return
             topic = received.topic

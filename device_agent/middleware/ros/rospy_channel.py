@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from device_agent.drivers.bridge_process import BridgeProcess
+from device_agent.middleware.bridge_process import BridgeProcess
 from device_agent.ports.driver import UnreachableError
 
 _START_S = 6.0

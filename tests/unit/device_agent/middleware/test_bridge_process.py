@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from device_agent.drivers import bridge_process
-from device_agent.drivers.bridge_process import BridgeProcess
+from device_agent.middleware import bridge_process
+from device_agent.middleware.bridge_process import BridgeProcess
 from device_agent.ports.driver import UnreachableError
 from tests.harness.network.brokers import wait_until
 

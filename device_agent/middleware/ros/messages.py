@@ -129,6 +129,40 @@ class CompressedImage(Struct, frozen=True):
     data: bytes
 
 
+class GoalId(Struct, frozen=True):
+    """``actionlib_msgs/GoalID``."""
+
+    id: str
+
+
+class GoalStatus(Struct, frozen=True):
+    """``actionlib_msgs/GoalStatus`` of ROS 1."""
+
+    goal_id: GoalId
+    status: int
+    text: str = ""
+
+
+class GoalStatuses(Struct, frozen=True):
+    """``actionlib_msgs/GoalStatusArray``. An action server of ROS 1 publishes it regularly."""
+
+    status_list: tuple[GoalStatus, ...]
+
+
+class TrajectoryResult(Struct, frozen=True):
+    """``control_msgs/FollowJointTrajectoryResult``. ``error_code`` is 0 after a successful motion."""
+
+    error_code: int = 0
+    error_string: str = ""
+
+
+class TrajectoryActionResult(Struct, frozen=True):
+    """``control_msgs/FollowJointTrajectoryActionResult`` of ROS 1."""
+
+    status: GoalStatus
+    result: TrajectoryResult
+
+
 class DiagnosticStatus(Struct, frozen=True):
     """``diagnostic_msgs/DiagnosticStatus``. Level: 0 OK, 1 warning, 2 error, 3 outdated."""
 
@@ -148,20 +182,23 @@ class Dialect:
 
     Args:
         ros: 1 or 2.
+
+    Attributes:
+        ros: 1 or 2.
     """
 
     def __init__(self, ros: int) -> None:
-        self._ros = ros
+        self.ros = ros
 
     def type(self, name: str) -> str:
         """Name of a message type: ``sensor_msgs/JointState`` is ``sensor_msgs/msg/JointState`` in ROS 2."""
         package, _, message = name.replace("/msg/", "/").partition("/")
-        return name if self._ros == 1 else f"{package}/msg/{message}"
+        return name if self.ros == 1 else f"{package}/msg/{message}"
 
     def time(self, time_s: float) -> Message:
         """A time or duration [s]."""
         seconds, nanoseconds = divmod(round(time_s * NS), NS)
-        names = ("secs", "nsecs") if self._ros == 1 else ("sec", "nanosec")
+        names = ("secs", "nsecs") if self.ros == 1 else ("sec", "nanosec")
         return dict(zip(names, (seconds, nanoseconds), strict=True))
 
     def trajectory(self, names: Sequence[str], position_rad: Sequence[float], duration_s: float) -> Message:
@@ -176,16 +213,10 @@ class Dialect:
         header = {"stamp": self.time(0.0), "frame_id": ""}
         return {"header": header, "joint_names": list(names), "points": [point]}
 
-    def goal(self, trajectory: Message, number: str) -> Message:
-        """A ``FollowJointTrajectoryActionGoal`` of ROS 1."""
-        goal_id = {"stamp": self.time(0.0), "id": number}
-        goal = {
-            "trajectory": trajectory,
-            "path_tolerance": [],
-            "goal_tolerance": [],
-            "goal_time_tolerance": self.time(0.0),
-        }
-        return {"goal_id": goal_id, "goal": goal}
+    def goal(self, trajectory: Message) -> Message:
+        """A ``FollowJointTrajectoryGoal``."""
+        tolerances: Message = {"path_tolerance": [], "goal_tolerance": []}
+        return {"trajectory": trajectory, **tolerances, "goal_time_tolerance": self.time(0.0)}
 
 
 def twist(linear: Sequence[float], turn_rad_s: float) -> Message:

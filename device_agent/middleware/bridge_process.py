@@ -11,7 +11,7 @@ from device_agent.ports.driver import UnreachableError
 
 _END_S = 2.0
 _CHECK_S = 0.1
-_MAX_LINE = 1 << 20
+_MAX_LINE = 8 << 20
 
 
 class BridgeProcess:
@@ -29,7 +29,7 @@ class BridgeProcess:
 
     def __init__(self, name: str, python: str, program: Path, *arguments: str) -> None:
         self._name = name
-        self._buffer = b""
+        self._parts: list[bytes] = []
         self._link, theirs = socket.socketpair()
         try:
             # A new session, so that Ctrl-C in a terminal does not end the bridge before it has stopped the robot.
@@ -70,9 +70,13 @@ class BridgeProcess:
             received = self._link.recv(1 << 16)
         except (OSError, ValueError) as error:
             raise self._ended() from error
-        if not received or len(self._buffer) > _MAX_LINE:
+        if not received or sum(map(len, self._parts)) > _MAX_LINE:
             raise self._ended()
-        *lines, self._buffer = (self._buffer + received).split(b"\n")
+        self._parts.append(received)
+        if b"\n" not in received:
+            return ()  # a part of a long message is not searched again
+        *lines, rest = b"".join(self._parts).split(b"\n")
+        self._parts = [rest]
         return lines
 
     def disconnect(self) -> None:

@@ -7,6 +7,7 @@ connection is used. Frames to send are built without shared state, so that no th
 import contextlib
 import select
 import socket
+import ssl
 import time
 from collections.abc import Sequence
 
@@ -16,13 +17,15 @@ from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
+from device_agent.middleware.ros.tls_socket import TlsSocket
 from device_agent.ports.driver import UnreachableError
 
 _TIMEOUT_S = 2.0
 """Time to connect, and for the response [s]."""
 _CHECK_S = 0.1
 _DEFAULT_PORT = 9090
-_MAX_MESSAGE = 1 << 20
+_MAX_MESSAGE = 8 << 20
+"""A raw picture with 1920 x 1080 pixels has 8.3 MB as Base64 [bytes]."""
 _DATA = (Opcode.TEXT, Opcode.BINARY, Opcode.CONT)
 
 
@@ -30,27 +33,41 @@ class RosbridgeChannel:
     """A connected WebSocket. See ``Channel``.
 
     Args:
-        address: ``host`` or ``host:port``.
+        address: ``host`` or ``host:port``, with ``wss://`` before it for TLS.
+        certificate_authority: File with the trusted certificates; empty: those of the system.
 
     Raises:
-        UnreachableError: There is no rosbridge server.
+        UnreachableError: There is no rosbridge server, or its certificate is not trusted.
     """
 
-    def __init__(self, address: str) -> None:
-        host, _, port = address.partition(":")
+    def __init__(self, address: str, *, certificate_authority: str = "") -> None:
+        scheme, _, rest = address.rpartition("://")
+        host, _, port = rest.partition(":")
         self.where = f"rosbridge at {host}:{port or _DEFAULT_PORT}"
-        self._protocol = ClientProtocol(parse_uri(f"ws://{host}:{port or _DEFAULT_PORT}/"), max_size=_MAX_MESSAGE)
+        uri = parse_uri(f"{scheme or 'ws'}://{host}:{port or _DEFAULT_PORT}/")
+        self._protocol = ClientProtocol(uri, max_size=_MAX_MESSAGE)
+        self._socket: socket.socket | TlsSocket
+        context = _trust(certificate_authority) if uri.secure else None
         self._parts: list[bytes] = []
         try:
-            self._socket = socket.create_connection((host, int(port or _DEFAULT_PORT)), timeout=_TIMEOUT_S)
+            connected = socket.create_connection((host, int(port or _DEFAULT_PORT)), timeout=_TIMEOUT_S)
         except (OSError, OverflowError) as error:
             raise UnreachableError(f"no connection to {self.where}: {error}; is rosbridge running?") from error
         try:
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._shake_hands()
-            self._socket.setblocking(False)
+            connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if context is not None:
+                connected = context.wrap_socket(connected, server_hostname=host)
+            self._shake_hands(connected)
+            connected.setblocking(False)
+            self._socket = TlsSocket(connected) if isinstance(connected, ssl.SSLSocket) else connected
+        except ssl.SSLCertVerificationError as error:
+            connected.close()
+            raise UnreachableError(
+                f"the certificate of {self.where} is not trusted: {error.verify_message}; "
+                "check the option 'certificate_authority' and the host name"
+            ) from error
         except (OSError, WebSocketException) as error:
-            self._socket.close()
+            connected.close()
             raise UnreachableError(f"{self.where} is no rosbridge server: {error}; check the port") from error
 
     def send(self, message: bytes) -> None:
@@ -86,12 +103,12 @@ class RosbridgeChannel:
         """See ``Channel``."""
         self._socket.close()
 
-    def _shake_hands(self) -> None:
+    def _shake_hands(self, connected: socket.socket) -> None:
         protocol, end_s = self._protocol, time.monotonic() + _TIMEOUT_S
         protocol.send_request(protocol.connect())
-        self._socket.sendall(b"".join(protocol.data_to_send()))
+        connected.sendall(b"".join(protocol.data_to_send()))
         while protocol.state is State.CONNECTING:
-            data = self._socket.recv(65536)
+            data = connected.recv(65536)
             if data:
                 protocol.receive_data(data)
             else:
@@ -117,3 +134,17 @@ class RosbridgeChannel:
         if data and self._socket.send(data, socket.MSG_DONTWAIT) < len(data):
             self.disconnect()
             raise ConnectionError("the other end does not receive; check the network")
+
+
+def _trust(certificate_authority: str) -> ssl.SSLContext:
+    """Settings that verify the server's certificate and host name.
+
+    Raises:
+        UnreachableError: The file cannot be read.
+    """
+    try:
+        return ssl.create_default_context(cafile=certificate_authority or None)
+    except OSError as error:
+        raise UnreachableError(
+            f"option 'certificate_authority': {certificate_authority} contains no certificates: {error}"
+        ) from error
