@@ -50,8 +50,8 @@ class ConfiguredDevice:
         self.device = device
         own = [stream.name for stream in device.streams]
         implied = {SETTINGS} if controls and SETTINGS in own and SETTINGS not in streams else set()
-        self._check("streams", own, {*streams, *implied})
-        self._check("controls", [control.name for control in device.controls], controls)
+        self._check_names("streams", own, {*streams, *implied})
+        self._check_names("controls", [control.name for control in device.controls], controls)
         if device.cameras or device.captures:
             raise SensorError(f"driver '{device.driver}' of '{device.name}' has no cameras and captures; remove them")
         for stream, quantities in streams.items():
@@ -83,7 +83,7 @@ class ConfiguredDevice:
         """The error of a call that needs a connection."""
         return SensorError(f"'{self.device.name}' is not connected")
 
-    def _check(self, label: str, own: Collection[str], mapped: Collection[str]) -> None:
+    def _check_names(self, label: str, own: Collection[str], mapped: Collection[str]) -> None:
         for name in own:
             if name not in mapped:
                 raise SensorError(f"'{self.device.name}' has no option '{label}.{name}', which maps it to the device")

@@ -91,7 +91,7 @@ class MqttDevice(ConfiguredDevice, ABC):
             return self.inbox.take(stream)
         if stream == SETTINGS and self._controls:
             return self._settings()
-        self.reject_unknown("stream", stream, [known.name for known in self.device.streams])
+        return self.reject_unknown("stream", stream, [known.name for known in self.device.streams])
 
     def set(self, control: str, value: float) -> float:
         """See ``RoomDriver``."""

@@ -4,6 +4,7 @@ Topics and messages: https://www.zigbee2mqtt.io/guide/usage/mqtt_topics_and_mess
 the devices, https://www.zigbee2mqtt.io/guide/usage/exposes.html
 """
 
+import contextlib
 import json
 import time
 from collections.abc import Collection, Iterator
@@ -106,19 +107,21 @@ class Zigbee2MqttDevice(MqttDevice):
         self._exposed: dict[str, _Expose] | None = None
         self._cover = False
         self._mismatch = ""
-        self._stopped = False
+        self._answered = False
 
     def hold(self) -> None:
-        """See ``Movable``."""
+        """See ``Movable``. A cover does not confirm ``STOP``; it must respond to a request of its position."""
         with self.changed:
-            cover, self._stopped = self._cover and bool(self._options.controls), False
+            cover, self._answered = self._cover and bool(self._options.controls), False
         if not cover:
             return
         self.publish(f"{self._topic}/set", json.dumps({"state": "STOP"}))
+        if not self._request():
+            return
         with self.changed:
-            stopped = self.changed.wait_for(lambda: self._stopped, _HOLD_S)
-        if not stopped:
-            raise SensorError(f"'{self.device.name}' has not confirmed within {_HOLD_S:g} s that it has stopped")
+            answered = self.changed.wait_for(lambda: self._answered, _HOLD_S)
+        if not answered:
+            raise SensorError(f"'{self.device.name}' has not responded within {_HOLD_S:g} s after it was stopped")
 
     # ------------------------------------------------------------ MqttDevice
 
@@ -143,7 +146,9 @@ class Zigbee2MqttDevice(MqttDevice):
         if self._exposed is None:
             return f"Zigbee2MQTT has not published '{self._bridge_devices}' yet"
         if self._available is False:
-            return f"'{self.device.name}' is off line: Zigbee device '{self._options.device}'; check its battery or power"
+            return (
+                f"'{self.device.name}' is off line: Zigbee device '{self._options.device}'; check its battery or power"
+            )
         return ""
 
     def on_message(self, topic: str, payload: bytes, *, retained: bool) -> None:
@@ -216,13 +221,27 @@ class Zigbee2MqttDevice(MqttDevice):
         self._mismatch = self._compare(exposed)
         self._cover = any(each.type == "cover" for each in exposes)
         self._exposed = exposed
+        with contextlib.suppress(SensorError):  # lost: the next connection repeats it
+            self._request()
+
+    def _request(self) -> bool:
+        """Request the values of the controls; returns whether one can be requested."""
+        exposed = self._exposed or {}
+        properties = {control.property for control in self._options.controls.values()}
+        requested = [name for name in properties if name in exposed and exposed[name].access & _GET]
+        if requested:
+            self.publish(f"{self._topic}/get", json.dumps(dict.fromkeys(requested, "")))
+        return bool(requested)
 
     def _compare(self, exposed: dict[str, _Expose]) -> str:
         """The first difference between the options and the description of the device."""
         where = f"Zigbee device '{self._options.device}'"
         for stream, sources in self._options.streams.items():
             for quantity, source in sources.items():
-                if json_path.find({**dict.fromkeys(_ADDED), **exposed}, source.path.partition(".")[0]) is json_path.MISSING:
+                if (
+                    json_path.find({**dict.fromkeys(_ADDED), **exposed}, source.path.partition(".")[0])
+                    is json_path.MISSING
+                ):
                     known = ", ".join(exposed)[:300] or "none"
                     return f"option 'streams.{stream}.{quantity}': {where} has no '{source.path}'; it has: {known}"
         for name, control in self._options.controls.items():
@@ -240,7 +259,7 @@ class Zigbee2MqttDevice(MqttDevice):
         if not isinstance(document, dict):
             self.fail("a message was rejected: it is not a JSON object")
             return
-        self._stopped = True
+        self._answered = True
         for name, control in self._options.controls.items():
             if (value := document.get(control.property)) is not None:
                 self.report(name, value, value)
@@ -260,7 +279,7 @@ def _properties(exposes: Collection[_Expose], depth: int) -> Iterator[_Expose]:
 def _online(payload: bytes) -> bool:
     """Whether a message of availability states ``online``: as JSON, or as a text by older versions."""
     try:
-        return json_path.find(json_path.decode(payload), "state") == "online"
+        return bool(json_path.find(json_path.decode(payload), "state") == "online")
     except ValueError:
         return payload == b"online"
 
