@@ -177,18 +177,7 @@ class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         for stream in self.room:
             lines += ["", "[[room]]", *_table(stream)]
         for device in self.devices:
-            lines += ["", "[[devices]]"]
-            lines += [f"{key} = {_toml(getattr(device, key))}" for key in ("name", "type", "driver", "label")]
-            if device.room:
-                lines.append(f"room = {_toml(device.room)}")
-            if device.described:
-                description = {field: getattr(device, field) for field in _DESCRIPTION}
-                lines += [f"{key} = {_toml(value)}" for key, value in msgspec.to_builtins(description).items() if value]
-            if device.options:
-                lines.append("[devices.options]")
-                lines += [f"{_toml(key)} = {_toml(value)}" for key, value in device.options.items()]
-            for rule in device.interlocks:
-                lines += ["", "[[devices.interlocks]]", *_table(rule)]
+            lines += ["", "[[devices]]", *_device_table(device)]
         private_file.write(folder / CONFIG_FILE, ("\n".join(lines) + "\n").encode())
 
     def with_manual_settings(self, previous: "AgentConfig") -> "AgentConfig":
@@ -237,7 +226,7 @@ def _check_description(device: DeviceEntry, path: Path) -> None:
         return
     if device.room:
         raise ConfigError(
-            f"{path}: the room '{device.room}' describes '{device.name}'; remove `room`, or its streams and controls here"
+            f"{path}: the room '{device.room}' describes '{device.name}'; remove `room`, or the description here"
         )
     if not device.driver:
         raise ConfigError(f"{path}: '{device.name}' needs `driver`; `python -m device_agent devices` lists the drivers")
@@ -249,6 +238,21 @@ def _check_description(device: DeviceEntry, path: Path) -> None:
 
 def _has_duplicates(names: Sequence[str]) -> bool:
     return len(set(names)) != len(names)
+
+
+def _device_table(device: DeviceEntry) -> list[str]:
+    lines = [f"{key} = {_toml(getattr(device, key))}" for key in ("name", "type", "driver", "label")]
+    if device.room:
+        lines.append(f"room = {_toml(device.room)}")
+    if device.described:
+        description = {field: getattr(device, field) for field in _DESCRIPTION}
+        lines += [f"{key} = {_toml(value)}" for key, value in msgspec.to_builtins(description).items() if value]
+    if device.options:
+        lines.append("[devices.options]")
+        lines += [f"{_toml(key)} = {_toml(value)}" for key, value in device.options.items()]
+    for rule in device.interlocks:
+        lines += ["", "[[devices.interlocks]]", *_table(rule)]
+    return lines
 
 
 def _table(entry: Struct) -> list[str]:

@@ -203,17 +203,9 @@ class MqttDevice(ConfiguredDevice, ABC):
                 name it is left out.
         """
         for stream, sources in self._streams.items():
-            values: dict[str, float | bool] = {}
+            own = {name: source for name, source in sources.items() if self.kind_of(source) == kind}
             try:
-                for quantity, source in sources.items():
-                    if self.kind_of(source) != kind:
-                        continue
-                    raw = json_path.find(document, source.path)
-                    if raw is not json_path.MISSING:
-                        values[quantity] = _converted(quantity, source, raw)
-                    elif kind:
-                        has = json_path.listed(document)
-                        raise ConversionError(f"{kind} has no '{source.path}' for {quantity}; it has: {has}")
+                values = _values(document, own, kind)
             except ConversionError as error:
                 self.inbox.fail(stream, f"stream '{stream}' of '{self.device.name}': {error}", kind)
             else:
@@ -281,8 +273,16 @@ class MqttDevice(ConfiguredDevice, ABC):
             self.changed.notify_all()
 
 
-def _converted(quantity: str, source: Conversion, raw: object) -> float | bool:
-    try:
-        return source.value(raw)
-    except ConversionError as error:
-        raise ConversionError(f"{quantity} is {error}") from error
+def _values(document: Any, sources: Mapping[str, JsonSource], kind: str) -> dict[str, float | bool]:
+    """The quantities in a message. A missing one is left out, or an error if the ``kind`` of message has a name."""
+    values: dict[str, float | bool] = {}
+    for quantity, source in sources.items():
+        raw = json_path.find(document, source.path)
+        if raw is not json_path.MISSING:
+            try:
+                values[quantity] = source.value(raw)
+            except ConversionError as error:
+                raise ConversionError(f"{quantity} is {error}") from error
+        elif kind:
+            raise ConversionError(f"{kind} has no '{source.path}' for {quantity}; it has: {json_path.listed(document)}")
+    return values

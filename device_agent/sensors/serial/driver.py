@@ -2,7 +2,6 @@
 
 import logging
 import threading
-from collections.abc import Mapping
 
 import serial
 
@@ -30,9 +29,9 @@ class SerialSensor(ConfiguredDevice):
 
     def __init__(self, device: RoomDeviceManifest, options: Options) -> None:
         counted = any(stream.name == LINES for stream in device.streams) and LINES not in options.streams
-        streams: dict[str, Mapping[str, object]] = dict(options.streams)
+        streams = {name: list(sources) for name, sources in options.streams.items()}
         if counted:
-            streams[LINES] = dict.fromkeys(("received", "malformed", "overlong"))
+            streams[LINES] = ["received", "malformed", "overlong"]
         super().__init__(device, streams=streams, controls=())
         self._options = options
         self._counted = counted
