@@ -64,10 +64,17 @@ class BrokerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class _BoundedClient(mqtt.Client):
-    """A client that ends the connection before it would receive a packet above ``_MAX_PACKET``."""
+    """A client that ends the connection before it would receive a packet above ``_MAX_PACKET``.
+
+    Attributes:
+        rejected: Size of the packet that ended the connection [bytes].
+    """
+
+    rejected = 0
 
     def _sock_recv(self, bufsize: int) -> bytes:
         if bufsize > _MAX_PACKET:
+            self.rejected = bufsize
             raise ConnectionError(f"a packet has {bufsize} bytes")
         return super()._sock_recv(bufsize)
 
@@ -150,8 +157,9 @@ class HomeBroker:
                 problem = str(error)
             except (OSError, ValueError, mqtt.WebsocketConnectionError) as error:
                 problem = f"the broker {self._where} cannot be reached: {_reason(error)}; check `broker` in the options"
-            self._set_problem(problem)
-            self._stopping.wait(_RETRY_S)
+            if not self._stopping.is_set():
+                self._set_problem(problem)
+                self._stopping.wait(_RETRY_S)
 
     def _session(self) -> str:
         """One connection, from its start to its end; returns why it ended."""
@@ -173,6 +181,8 @@ class HomeBroker:
                 self._client = None
                 client.disconnect()
                 self._free(client)
+        if client.rejected:
+            return f"the broker {self._where} has sent a message of {client.rejected} bytes; the limit is {_MAX_PACKET}"
         return self.problem or f"the connection to the broker {self._where} is lost"
 
     def _turn(self, client: mqtt.Client, selector: selectors.BaseSelector, opened: Any) -> None:
@@ -194,7 +204,7 @@ class HomeBroker:
                 remaining.close()
         client._reset_sockets()  # noqa: SLF001 (closes the socket pair that the library opens for a thread of its own)
 
-    def _new_client(self) -> mqtt.Client:
+    def _new_client(self) -> _BoundedClient:
         client = _BoundedClient(
             CallbackAPIVersion.VERSION2,
             self._client_id,

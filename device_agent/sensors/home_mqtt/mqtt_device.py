@@ -268,6 +268,8 @@ class MqttDevice(ConfiguredDevice, ABC):
                 self.on_connected()
 
     def _receive(self, topic: str, payload: bytes, retained: bool) -> None:
+        if not payload:
+            return  # removes a retained message
         with self.changed:
             self.on_message(topic, payload, retained=retained)
             self.changed.notify_all()

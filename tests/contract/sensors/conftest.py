@@ -5,11 +5,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from device_agent import sensors
 from device_agent.config.agent_config import DeviceEntry
-from device_agent.ports.sensor import RoomDriver, Surroundings
+from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from tests.harness.network.brokers import wait_until
 from tests.harness.robots.room_devices.house_broker import HouseBroker
@@ -45,13 +46,7 @@ def make_driver(tmp_path: Path) -> Iterator[MakeDriver]:
 def described(driver: str, options: dict[str, Any], **description: Any) -> RoomDeviceManifest:
     """A device as an entry of ``agent.toml`` describes it."""
     entry = {"name": "device", "type": "test_device", "driver": driver, "options": options, **description}
-    return convert(entry).room_device()
-
-
-def convert(entry: dict[str, Any]) -> DeviceEntry:
-    import msgspec
-
-    return msgspec.convert(entry, DeviceEntry)
+    return msgspec.convert(entry, DeviceEntry).room_device()
 
 
 def sample(driver: RoomDriver, stream: str) -> dict[str, float | bool]:
@@ -64,3 +59,16 @@ def sample(driver: RoomDriver, stream: str) -> dict[str, float | bool]:
 
     wait_until(arrived, f"a sample of {stream}")
     return found
+
+
+def error_of(call: Callable[[], object]) -> str:
+    """The message with which a call fails; empty if it does not."""
+    try:
+        call()
+    except SensorError as error:
+        return str(error)
+    return ""
+
+
+def connects(driver: RoomDriver) -> bool:
+    return not error_of(driver.connect)

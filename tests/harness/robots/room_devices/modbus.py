@@ -32,6 +32,7 @@ class ModbusPeer:
         silent: Whether the server answers nothing.
         ignore_writes: Whether writes are confirmed but not done.
         requests: Function code, address and count of each request.
+        place: Options of the driver with which it is reached; set by the test.
     """
 
     def __init__(self, *, path: str = "", port: int = 0, unit: int = 1) -> None:
@@ -40,6 +41,7 @@ class ModbusPeer:
         self.silent = self.ignore_writes = False
         self.requests: list[tuple[int, int, int]] = []
         self.port = port
+        self.place: dict[str, Any] = {}
         self._path = path
         self._unit = unit
         self._loop = asyncio.new_event_loop()
