@@ -46,7 +46,7 @@ class ModbusPeer:
         self._unit = unit
         self._loop = asyncio.new_event_loop()
         self._ready = threading.Event()
-        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._serve(),))
+        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._serve(),), daemon=True)
         self._thread.start()
         assert self._ready.wait(PATIENCE_S)
 
@@ -54,35 +54,47 @@ class ModbusPeer:
         self.tables[table][address : address + len(values)] = values
 
     async def _serve(self) -> None:
-        registers = [SimData(0, values=0, count=SIZE)]
-        bits = [SimData(0, values=0, count=SIZE)]
-        device = SimDevice(self._unit, (bits, bits, registers, registers), action=self._act)
+        unused = SimDevice(self._unit, SimData(0, values=0))
         common: dict[str, Any] = {"trace_packet": self._trace}
         if self._path:
-            self._server: Any = ModbusSerialServer([device], port=self._path, baudrate=9600, **common)
+            server: Any = ModbusSerialServer(unused, port=self._path, baudrate=9600, **common)
         else:
-            self._server = ModbusTcpServer([device], address=(HOST, self.port), **common)
-        await self._server.serve_forever(background=True)
+            server = ModbusTcpServer(unused, address=(HOST, self.port), **common)
+        server.context = self
+        await server.serve_forever(background=True)
         if not self._path:
-            self.port = self._server.transport.sockets[0].getsockname()[1]
+            self.port = server.transport.sockets[0].getsockname()[1]
         self._ended = asyncio.Event()
         self._ready.set()
         await self._ended.wait()
-        await self._server.shutdown()
+        await server.shutdown()
 
-    async def _act(
-        self, function: int, start: int, address: int, count: int, current: list[Any], values: list[Any] | None
-    ) -> ExcCodes | None:
+    def device_ids(self) -> list[int]:
+        """See ``pymodbus.simulator.SimCore``, as the following."""
+        return [self._unit]
+
+    async def async_getValues(  # noqa: N802 (pymodbus's name)
+        self, device_id: int, function: int, address: int, count: int = 1
+    ) -> list[int] | ExcCodes:
+        assert device_id == self._unit
         self.requests.append((function, address, count))
-        if self.fault is not None:
-            return self.fault
-        table = self.tables[TABLES[function]]
-        if values is not None and not self.ignore_writes:
-            table[address : address + count] = [int(value) for value in values]
-        current[address - start : address - start + count] = table[address : address + count]
-        if values is not None:
-            values[:] = table[address : address + count]
-        return None
+        if not self._has(address, count):
+            return ExcCodes.ILLEGAL_ADDRESS
+        return self.fault or self.tables[TABLES[function]][address : address + count]
+
+    async def async_setValues(  # noqa: N802 (pymodbus's name)
+        self, device_id: int, function: int, address: int, values: list[int]
+    ) -> ExcCodes | None:
+        assert device_id == self._unit
+        if not self._has(address, len(values)):
+            return ExcCodes.ILLEGAL_ADDRESS
+        if self.fault is None and not self.ignore_writes:
+            self.put(TABLES[function], address, [int(value) for value in values])
+        return self.fault
+
+    @staticmethod
+    def _has(address: int, count: int) -> bool:
+        return address + count <= SIZE
 
     def _trace(self, sending: bool, data: bytes) -> bytes:
         return b"" if sending and self.silent else data

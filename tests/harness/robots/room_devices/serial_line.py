@@ -42,7 +42,7 @@ class SerialCable:
     def __init__(self) -> None:
         self.near, self.far = SerialLine(), SerialLine()
         self._stop_reader, self._stop_writer = os.pipe()
-        self._thread = threading.Thread(target=self._copy)
+        self._thread = threading.Thread(target=self._copy, daemon=True)
         self._thread.start()
 
     def _copy(self) -> None:
