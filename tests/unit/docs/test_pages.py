@@ -31,6 +31,7 @@ EXECUTED = {
     "docs/guides/operate-a-site.md": "tests/integration/docs/test_guides.py",
     "docs/guides/security-on-a-site.md": "tests/integration/docs/test_guides.py",
     "docs/guides/add-a-sensor.md": "tests/unit/device_agent/sensors/test_add_a_sensor.py",
+    "docs/guides/room-devices.md": "tests/unit/device_agent/sensors/test_configured_devices.py",
     "docs/robots/ros.md": "tests/e2e/product/test_ros.py",
     "docs/reference/scripts.md": "tests/e2e/product/test_readme.py",
     "docs/reference/room-and-perception.md": "tests/unit/docs/test_pages.py",
