@@ -120,7 +120,9 @@ def test_a_device_that_keeps_its_value_is_an_error(network_peer: ModbusPeer, mak
     driver.connect()
     network_peer.ignore_writes = True
     for control in CONTROLS:
-        with pytest.raises(SensorError, match=f"control '{control}' of 'device': .* was written to .*, but the device has 0"):
+        with pytest.raises(
+            SensorError, match=f"control '{control}' of 'device': .* was written to .*, but the device has 0"
+        ):
             driver.set(control, 1.0)
 
 
@@ -135,7 +137,9 @@ def test_an_illegal_address_names_register_and_option(peer: ModbusPeer, make_dri
 
 def test_a_wrong_address_of_a_control_is_found_at_the_start(network_peer: ModbusPeer, make_driver: MakeDriver) -> None:
     entry = entry_of(network_peer.place, settings=False, controls={"pump": {"address": SIZE, "table": "coil"}})
-    assert f"coil {SIZE}: exception 2, illegal data address; check 'controls.pump'" in error_of(make_driver(entry).connect)
+    assert f"coil {SIZE}: exception 2, illegal data address; check 'controls.pump'" in error_of(
+        make_driver(entry).connect
+    )
 
 
 @pytest.mark.parametrize(

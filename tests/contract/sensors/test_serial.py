@@ -26,11 +26,7 @@ CSV = {
     "separator": ";",
     "streams": {"air": {"temperature_c": {"field": 1}, "humidity": {"field": 2, "scale": 0.01}}},
 }
-LINES = {
-    "pattern": b"T=21.5 H=40%\r\n",
-    "json": b'{"air": {"t": 21.5, "h": 40}}\n',
-    "csv": b"7;21.5;40\n",
-}
+LINES = {"pattern": b"T=21.5 H=40%\r\n", "json": b'{"air": {"t": 21.5, "h": 40}}\n', "csv": b"7;21.5;40\n"}
 OPTIONS: dict[str, dict[str, Any]] = {"pattern": PATTERN, "json": JSON, "csv": CSV}
 
 
@@ -127,7 +123,9 @@ def test_an_unplugged_sensor_is_a_fault_until_it_returns(make_driver: MakeDriver
     first.write(b"\nT=1.5 H=2%\n")
     assert sample(driver, "air")["temperature_c"] == 1.5
     first.unplug()
-    wait_until(lambda: "does not respond; check that it is plugged in" in error_of(lambda: driver.read("air")), "a fault")
+    wait_until(
+        lambda: "does not respond; check that it is plugged in" in error_of(lambda: driver.read("air")), "a fault"
+    )
     link.unlink()
     assert "cannot be opened; check that the sensor is plugged in" in error_of(driver.connect)
     with SerialLine() as second:

@@ -101,13 +101,13 @@ def test_relay_dimmer_and_shutter_confirm_the_applied_value(connected: RoomDrive
     assert connected.read("settings") == pytest.approx({"relay": 1.0, "level": 0.33, "opening": 0.6})
 
 
-def test_a_command_without_confirmation_fails(
-    house: HouseBroker, tasmota: Tasmota, make_driver: MakeDriver
-) -> None:
+def test_a_command_without_confirmation_fails(house: HouseBroker, tasmota: Tasmota, make_driver: MakeDriver) -> None:
     driver = make_driver(entry_of(house, timeout_s=0.3))
     driver.connect()
     tasmota.silent = True
-    with pytest.raises(SensorError, match=r"has not confirmed 'relay' within 0.3 s: 'ON' was requested, and it reports"):
+    with pytest.raises(
+        SensorError, match=r"has not confirmed 'relay' within 0.3 s: 'ON' was requested, and it reports"
+    ):
         driver.set("relay", 1.0)
 
 

@@ -107,7 +107,11 @@ def watching(site: Site, person: Person) -> Client:
 def test_a_viewer_sees_the_thermometer_and_an_operator_switches_the_relay(site: Site) -> None:
     viewer, operator = site.shared("victor", "viewer"), site.shared("oscar", "operator")
     plug = f"/devices/{site.ids['plug']}"
-    switch = {"request": {"kind": "set_control", "control": "relay", "value": 1.0}, "wait_for": "done", "wait_ms": 20_000}
+    switch = {
+        "request": {"kind": "set_control", "control": "relay", "value": 1.0},
+        "wait_for": "done",
+        "wait_ms": 20_000,
+    }
 
     with watching(site, viewer) as client:
         seen: list[float | bool] = []
