@@ -43,22 +43,24 @@ def bridge(house: HouseBroker) -> Iterator[Zigbee2Mqtt]:
 
 
 @pytest.fixture
-def connected(bridge: Zigbee2Mqtt, house: HouseBroker, make_driver: MakeDriver) -> RoomDriver:
+def connected(bridge: Zigbee2Mqtt, house: HouseBroker, make_driver: MakeDriver) -> RoomDriver:  # noqa: ARG001 (it must run)
     driver = make_driver(thermometer(house))
     driver.connect()
     return driver
 
 
+@pytest.mark.usefixtures("bridge")
 class TestThermometer(RoomDriverContract):
     @pytest.fixture
     def entry(self, house: HouseBroker) -> RoomDeviceManifest:
         return thermometer(house)
 
     @pytest.fixture
-    def driver(self, bridge: Zigbee2Mqtt, entry: RoomDeviceManifest, make_driver: MakeDriver) -> RoomDriver:
+    def driver(self, entry: RoomDeviceManifest, make_driver: MakeDriver) -> RoomDriver:
         return make_driver(entry)
 
 
+@pytest.mark.usefixtures("bridge")
 class TestBulb(RoomDriverContract):
     resolution = 0.5  # it is on or off
 
@@ -67,7 +69,7 @@ class TestBulb(RoomDriverContract):
         return settable(house, "bulb", on={"property": "state"}, level={"property": "brightness", "scale": 1 / 254})
 
     @pytest.fixture
-    def driver(self, bridge: Zigbee2Mqtt, entry: RoomDeviceManifest, make_driver: MakeDriver) -> RoomDriver:
+    def driver(self, entry: RoomDeviceManifest, make_driver: MakeDriver) -> RoomDriver:
         return make_driver(entry)
 
 
@@ -163,6 +165,7 @@ def test_an_unusable_measurement_is_a_fault_until_a_usable_one_arrives(
     wait_until(lambda: connects(connected), "the end of the fault")
 
 
+@pytest.mark.usefixtures("bridge")
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -175,15 +178,14 @@ def test_an_unusable_measurement_is_a_fault_until_a_usable_one_arrives(
     ],
 )
 def test_options_that_do_not_fit_the_device_are_named(
-    house: HouseBroker, bridge: Zigbee2Mqtt, make_driver: MakeDriver, options: dict[str, Any], message: str
+    house: HouseBroker, make_driver: MakeDriver, options: dict[str, Any], message: str
 ) -> None:
     driver = make_driver(thermometer(house, **options))
     wait_until(lambda: message in error_of(driver.connect), message)
 
 
-def test_a_property_that_cannot_be_set_is_named(
-    house: HouseBroker, bridge: Zigbee2Mqtt, make_driver: MakeDriver
-) -> None:
+@pytest.mark.usefixtures("bridge")
+def test_a_property_that_cannot_be_set_is_named(house: HouseBroker, make_driver: MakeDriver) -> None:
     driver = make_driver(settable(house, "plug", power={"property": "power"}))
     expected = "option 'controls.power': Zigbee device 'plug' cannot set 'power'; it can set: state"
     wait_until(lambda: expected in error_of(driver.connect), expected)

@@ -117,9 +117,11 @@ def test_a_viewer_sees_the_thermometer_and_an_operator_switches_the_relay(site: 
         seen: list[float | bool] = []
 
         def sees(value: float) -> bool:
-            for message in client.pending():
-                if message.topic.endswith(f"/boiler/{topics.TELE}/water"):
-                    seen.append(codec.decode(message.payload, Measurements).values["temperature_c"])
+            seen.extend(
+                codec.decode(message.payload, Measurements).values["temperature_c"]
+                for message in client.pending()
+                if message.topic.endswith(f"/boiler/{topics.TELE}/water")
+            )
             return bool(seen) and seen[-1] == pytest.approx(value)
 
         wait_until(lambda: sees(65.5), "the value of the thermometer")

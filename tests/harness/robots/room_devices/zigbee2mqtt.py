@@ -59,7 +59,7 @@ class Zigbee2Mqtt:
 
     def describe(self, **more: list[dict[str, Any]]) -> None:
         """Publish ``bridge/devices``."""
-        devices = [{"friendly_name": "Coordinator", "type": "Coordinator", "definition": None}]
+        devices: list[dict[str, Any]] = [{"friendly_name": "Coordinator", "type": "Coordinator", "definition": None}]
         devices += [
             {"friendly_name": name, "type": "EndDevice", "definition": {"model": "x", "exposes": exposes}}
             for name, exposes in {**EXPOSES, **more}.items()

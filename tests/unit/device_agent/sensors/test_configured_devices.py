@@ -50,7 +50,7 @@ def test_the_guide_shows_each_driver() -> None:
 def test_a_missing_library_is_named_with_its_command(monkeypatch: pytest.MonkeyPatch, driver: str) -> None:
     library = {"modbus": "pymodbus", "serial": "serial"}[driver]
     for name in list(sys.modules):
-        if name.split(".")[0] == library or name.startswith(f"device_agent.sensors.{driver}"):
+        if name.partition(".")[0] == library or name.startswith(f"device_agent.sensors.{driver}"):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(sys, "meta_path", [Hidden(library), *sys.meta_path])
     with pytest.raises(SensorError) as error:
@@ -66,7 +66,7 @@ class Hidden:
         self._package = package
 
     def find_spec(self, name: str, *_: object) -> None:
-        if name.split(".")[0] == self._package:
+        if name.partition(".")[0] == self._package:
             raise ModuleNotFoundError(f"No module named '{name}'", name=self._package)
 
 
