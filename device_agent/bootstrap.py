@@ -343,15 +343,10 @@ def _obstacle_map(neighbours: Mapping[str, RoomDriver]) -> ObstacleMap | None:
 def _outbox(
     store: IdentityStore, configuration: AgentConfig, pairing: Pairing, *, publish: Publish, quiet: Callable[[], bool]
 ) -> Outbox:
-    own = f"{topics.ROOT}/{pairing.space}/{pairing.agent}/"
-    buffer = configuration.buffer
-    outbox_store = OutboxStore(
-        store.outbox, own=own, max_bytes=round(buffer.max_mb * 1e6), max_age_ms=round(buffer.max_age_h * 3_600_000)
-    )
-    device_topic = own + configuration.devices[0].name
-    return Outbox(
-        outbox_store, publish=publish, device_topic=device_topic, is_quiet=quiet, keep_hz=buffer.measurements_hz
-    )
+    own, buffer = f"{topics.ROOT}/{pairing.space}/{pairing.agent}/", configuration.buffer
+    limits = {"max_bytes": round(buffer.max_mb * 1e6), "max_age_ms": round(buffer.max_age_h * 3_600_000)}
+    kept, topic = OutboxStore(store.outbox, own=own, **limits), own + configuration.devices[0].name
+    return Outbox(kept, publish=publish, device_topic=topic, is_quiet=quiet, keep_hz=buffer.measurements_hz)
 
 
 def _device(

@@ -1,6 +1,7 @@
 """Connections to Modbus devices. All devices at one address share one, because a serial line allows only one."""
 
 import logging
+import struct
 import threading
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,8 +14,12 @@ from pymodbus.pdu import ModbusPDU
 from device_agent.ports.sensor import SensorError
 from device_agent.sensors.modbus.options import Options
 
-_ATTEMPTS = 2
-"""Number of attempts of a read: a device may have closed an idle connection, and a serial line may be disturbed."""
+_BUSY_S = 4.0
+"""Maximum time to wait for requests of other devices at the same line [s]."""
+_MALFORMED = (ValueError, LookupError, TypeError, struct.error)
+"""Errors of the library for responses of a defective device."""
+_READ_ATTEMPTS = 2
+"""Attempts of a read. A device may have closed an idle connection, and a serial line may be disturbed."""
 EXCEPTIONS = {
     1: "illegal function",
     2: "illegal data address",
@@ -73,25 +78,31 @@ class Bus:
             SensorError: No connection, or no response.
             ResponseError: The device has responded with an exception code.
         """
-        with self._lock:
-            self._client.comm_params.timeout_connect = timeout_s
-            for attempt in range(1, _ATTEMPTS + 1):
-                try:
-                    if not self._client.connect():
-                        raise SensorError(f"{self.line.where} cannot be opened; {self._advice()}")
-                    response = send(self._client)
-                except (ModbusException, OSError) as error:
-                    self._client.close()  # type: ignore[no-untyped-call] # a late response must not be taken for that of the next request
-                    if write or attempt == _ATTEMPTS:
-                        raise SensorError(
-                            f"no response at {self.line.where} within {timeout_s:g} s; check power, wiring, `unit` and "
-                            "the settings of the line"
-                        ) from error
-                else:
-                    break
+        if not self._lock.acquire(timeout=_BUSY_S):
+            raise SensorError(f"{self.line.where} is busy: another device at this line does not respond")
+        try:
+            response = self._send(send, timeout_s, attempts=1 if write else _READ_ATTEMPTS)
+        finally:
+            self._lock.release()
         if response.isError():
             raise ResponseError(response.exception_code)
         return response
+
+    def _send(self, send: Callable[[ModbusBaseSyncClient], ModbusPDU], timeout_s: float, attempts: int) -> ModbusPDU:
+        self._client.comm_params.timeout_connect = timeout_s
+        while True:
+            attempts -= 1
+            if not self._client.connect():
+                raise SensorError(f"{self.line.where} cannot be opened; {self._advice()}")
+            try:
+                return send(self._client)
+            except (ModbusException, OSError, *_MALFORMED) as error:
+                self._client.close()  # type: ignore[no-untyped-call] # a late response must not answer the next request
+                if attempts == 0:
+                    raise SensorError(
+                        f"no valid response at {self.line.where} within {timeout_s:g} s; check power, wiring, `unit` "
+                        "and the settings of the line"
+                    ) from error
 
     def close(self) -> None:
         """Close the connection; the next request opens it again."""

@@ -106,7 +106,7 @@ class Options(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     parity: Literal["none", "even", "odd"] = "none"
     stop_bits: Literal[1, 2] = 1
     unit: Annotated[int, Meta(ge=0, le=255)] = 1
-    timeout_s: Annotated[float, Meta(ge=0.05, le=3)] = 1.0
+    timeout_s: Annotated[float, Meta(ge=0.05, le=2)] = 1.0
     streams: dict[Id, dict[Field, Point]] = {}
     controls: dict[Id, ControlPoint] = {}
 

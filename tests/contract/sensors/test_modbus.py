@@ -2,6 +2,7 @@
 
 import contextlib
 import socket
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -168,9 +169,9 @@ def test_a_device_without_response_is_a_fault_that_ends(peer: ModbusPeer, make_d
     driver = make_driver(entry_of(peer.place))
     driver.connect()
     peer.silent = True
-    assert "no response at" in error_of(lambda: driver.read("climate"))
-    assert "no response at" in error_of(driver.connect)
-    assert "no response at" in error_of(lambda: driver.set("pump", 1.0))
+    assert "no valid response at" in error_of(lambda: driver.read("climate"))
+    assert "no valid response at" in error_of(driver.connect)
+    assert "no valid response at" in error_of(lambda: driver.set("pump", 1.0))
     peer.silent = False
     wait_until(lambda: connects(driver), "the device")
     assert driver.read("climate")["temperature_c"] == pytest.approx(21.4)
@@ -258,3 +259,50 @@ def test_wrong_options_are_named(make_driver: MakeDriver, options: dict[str, Any
     with pytest.raises(SensorError) as error:
         make_driver(entry_of({}, **options))
     assert message in str(error.value)
+
+
+@pytest.fixture
+def hostile() -> Iterator[tuple[int, list[bytes]]]:
+    """Port of a server that answers each request with the next of these byte strings, and then closes."""
+    answers: list[bytes] = []
+    with socket.create_server((HOST, 0)) as listener:
+
+        def serve() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    opened, _ = listener.accept()
+                    with opened:
+                        request = opened.recv(300)
+                        opened.sendall(request[:2] + answers[0])
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield listener.getsockname()[1], answers
+        listener.shutdown(socket.SHUT_RDWR)
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"\x00\x00\x00\x03\x01\x84\x7f",  # unknown exception code
+        b"\x00\x00\x00\x05\x01\x04\x02\x00\x01",  # one register instead of five
+        b"\x00\x00\x00\x04\x01\x04\xff\x00",  # length of the data is wrong
+        b"\x00\x00\x00\x03\x01\x04\x00",  # no data
+        b"\x00\x00\x00\x03\x01\x03\x02\x00\x01",  # another function
+        b"\x00\x00\xff\xff\x01\x04" + b"x" * 1000,  # length of the frame is wrong
+        b"\x00\x00\x00\x02\x01\x84",  # exception without code
+        b"\x00\x00\x00\x00",
+        b"\xff" * 400,
+        b"",
+    ],
+    ids=lambda answer: answer[:10].hex(),
+)
+def test_a_malformed_response_is_a_fault(
+    hostile: tuple[int, list[bytes]], make_driver: MakeDriver, answer: bytes
+) -> None:
+    port, answers = hostile
+    answers.append(answer)
+    driver = make_driver(entry_of({"host": HOST, "port": port, "timeout_s": 0.2}, controls={}))
+    error = error_of(driver.connect)
+    assert "no valid response" in error or "exception 127, unknown" in error or "has sent" in error, error

@@ -91,7 +91,7 @@ def test_the_agent_accepts_the_configuration_examples() -> None:
     interlock = block(DOCS / "reference" / "room-and-perception.md", "file", "interlock.toml")
     both = agent.replace("[[room]]", interlock + "\n[[room]]")
     configuration = msgspec.convert(tomllib.loads(both), AgentConfig)
-    assert configuration.devices[1].interlocks[0].stale_s == 2.0
+    assert configuration.devices[-1].interlocks[0].stale_s == 2.0
 
 
 def test_every_setting_of_the_product_is_documented() -> None:
