@@ -84,6 +84,9 @@ def test_a_retained_message_is_no_sample(house: HouseBroker, bridge: Zigbee2Mqtt
     driver = make_driver(thermometer(house))
     driver.connect()
     bridge.publish("thermometer", b"", retain=True)
+    bridge.publish("thermometer/availability", {"state": "online"})
+    wait_until(lambda: driver._available, "a message that follows the retained one")  # type: ignore[attr-defined]
+    assert driver.read("air") == {}
     bridge.send("thermometer", temperature=20.0)
     assert sample(driver, "air")["temperature_c"] == 20.0
 
@@ -94,6 +97,9 @@ def test_a_message_with_an_old_last_seen_is_no_sample(connected: RoomDriver, bri
         return datetime.fromtimestamp(at_s, UTC).isoformat() if form == "iso" else round(at_s * 1000)
 
     bridge.send("thermometer", temperature=70.0, last_seen=last_seen(time.time() - 3600))
+    bridge.publish("thermometer/availability", {"state": "online"})
+    wait_until(lambda: connected._available, "a message that follows the old one")  # type: ignore[attr-defined]
+    assert connected.read("air") == {}
     bridge.send("thermometer", temperature=21.0, last_seen=last_seen(time.time()))
     assert sample(connected, "air")["temperature_c"] == 21.0
 
