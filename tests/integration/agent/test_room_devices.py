@@ -107,7 +107,7 @@ def watching(site: Site, person: Person) -> Client:
 def test_a_viewer_sees_the_thermometer_and_an_operator_switches_the_relay(site: Site) -> None:
     viewer, operator = site.shared("victor", "viewer"), site.shared("oscar", "operator")
     plug = f"/devices/{site.ids['plug']}"
-    switch = {
+    switch: dict[str, Any] = {
         "request": {"kind": "set_control", "control": "relay", "value": 1.0},
         "wait_for": "done",
         "wait_ms": 20_000,
@@ -139,7 +139,9 @@ def test_a_viewer_sees_the_thermometer_and_an_operator_switches_the_relay(site: 
 
     site.tasmota.vanish()
     wait_until(lambda: "is off line" in str(site.state("plug")["state"]), "the fault of the plug")
-    failed = operator.post(f"{plug}/actions", {**switch, "epoch": lease["epoch"]}).json()
-    assert (failed["status"], failed["reason"]["code"]) == ("failed", "sensor_failed"), failed
+    off = {**switch, "request": {**switch["request"], "value": 0.0}, "epoch": lease["epoch"]}
+    failed = operator.post(f"{plug}/actions", off).json()
+    assert (failed["status"], failed["reason"]["code"]) == ("failed", "lease_ended"), "a fault ends control"
+    assert site.tasmota.state["POWER"] == "ON"
     assert site.state("boiler")["state"]["faults"] == []
     assert PASSWORD not in site.log.read_text()
