@@ -153,6 +153,7 @@ def create_room_device(
     neighbours: Mapping[str, RoomDriver],
     uploads: Uploads | None = None,
     *,
+    home: Path,
     faults: Path | None = None,
 ) -> RoomDevice | None:
     """Create a room device, not connected; ``None`` for a robot.
@@ -161,6 +162,7 @@ def create_room_device(
         entry: The device; its options override those of the room's manifest.
         neighbours: The agent's room drivers by name, completed while they are created.
         uploads: Destination of captures.
+        home: The agent's folder; files that ``agent.toml`` names are relative to it.
         faults: Folder of injected faults of simulated devices, ``{device}.toml`` each.
 
     Raises:
@@ -175,14 +177,15 @@ def create_room_device(
         options.setdefault("faults", str(faults / f"{entry.name}.toml"))
     manifest = msgspec.structs.replace(device, label=entry.label or device.label, driver=driver, options=options)
     try:
-        sensor = sensors.load(driver)(manifest, ROOMS.folder(entry.room), _surroundings(entry.room, neighbours))
+        folder = ROOMS.folder(entry.room) if entry.room else home
+        sensor = sensors.load(driver)(manifest, folder, _surroundings(entry.room, neighbours))
         return RoomDevice(sensor, manifest, uploads)
     except SensorError as error:
         raise ConfigError(str(error)) from error
 
 
 def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundings:
-    if not ROOMS.load(room).model:
+    if not room or not ROOMS.load(room).model:
         return Surroundings(neighbours=neighbours)
     from device_agent.simulation import world_registry  # noqa: PLC0415 (a real room needs no simulation)
 
@@ -289,7 +292,7 @@ def build(
     devices: dict[str, Device] = {}
     neighbours: dict[str, RoomDriver] = {}
     for entry in configuration.devices:
-        room_device = create_room_device(entry, neighbours, uploads, faults=store.faults)
+        room_device = create_room_device(entry, neighbours, uploads, home=store.folder, faults=store.faults)
         if room_device is not None:
             neighbours[entry.name] = room_device.driver
         devices[entry.name] = _device(
@@ -340,15 +343,10 @@ def _obstacle_map(neighbours: Mapping[str, RoomDriver]) -> ObstacleMap | None:
 def _outbox(
     store: IdentityStore, configuration: AgentConfig, pairing: Pairing, *, publish: Publish, quiet: Callable[[], bool]
 ) -> Outbox:
-    own = f"{topics.ROOT}/{pairing.space}/{pairing.agent}/"
-    buffer = configuration.buffer
-    outbox_store = OutboxStore(
-        store.outbox, own=own, max_bytes=round(buffer.max_mb * 1e6), max_age_ms=round(buffer.max_age_h * 3_600_000)
-    )
-    device_topic = own + configuration.devices[0].name
-    return Outbox(
-        outbox_store, publish=publish, device_topic=device_topic, is_quiet=quiet, keep_hz=buffer.measurements_hz
-    )
+    own, buffer = f"{topics.ROOT}/{pairing.space}/{pairing.agent}/", configuration.buffer
+    limits = {"max_bytes": round(buffer.max_mb * 1e6), "max_age_ms": round(buffer.max_age_h * 3_600_000)}
+    kept, topic = OutboxStore(store.outbox, own=own, **limits), own + configuration.devices[0].name
+    return Outbox(kept, publish=publish, device_topic=topic, is_quiet=quiet, keep_hz=buffer.measurements_hz)
 
 
 def _device(

@@ -13,7 +13,11 @@ from msgspec.structs import replace
 from device_agent.config import private_file
 from device_agent.config.errors import ConfigError
 from device_agent.config.interlock_rule import InterlockRule
-from device_agent.protocol import Id, Label
+from device_agent.protocol import Id, Label, Stream, Vector3
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.manifests import room as rooms
+from device_agent.protocol.manifests.robot_type import Diagnostic
+from device_agent.protocol.manifests.room import Control, RoomDeviceManifest, Watch
 
 CONFIG_FILE = "agent.toml"
 
@@ -21,14 +25,17 @@ CONFIG_FILE = "agent.toml"
 class DeviceEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One ``[[devices]]`` of ``agent.toml``.
 
+    A room device that no room manifest describes is described here, with the fields of ``RoomDeviceManifest``.
+
     Attributes:
         name: Name of the device, unique at this agent.
-        type: Robot type.
+        type: Robot type; for a room device its kind, for example ``thermometer``.
         room: Room whose manifest lists a robot or device of the same name and type; empty for none.
         driver: Driver name; empty for the driver of the robot type.
         label: Display name; empty for the label of the robot type.
         options: Options of the driver.
         interlocks: Interlocks of the device.
+        streams: As in ``RoomDeviceManifest``, and so are the following.
     """
 
     name: Id
@@ -38,6 +45,33 @@ class DeviceEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     label: Label = ""
     options: dict[str, Any] = {}
     interlocks: Annotated[tuple[InterlockRule, ...], Meta(max_length=32)] = ()
+    streams: Annotated[tuple[Stream, ...], Meta(max_length=16)] = ()
+    cameras: Annotated[tuple[Stream, ...], Meta(max_length=4)] = ()
+    captures: Annotated[tuple[Id, ...], Meta(max_length=16)] = ()
+    controls: Annotated[tuple[Control, ...], Meta(max_length=16)] = ()
+    diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=32)] = ()
+    watch: Annotated[tuple[Watch, ...], Meta(max_length=20)] = ()
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+
+    @property
+    def described(self) -> bool:
+        """Whether the entry itself describes a room device."""
+        return bool(self.streams or self.cameras or self.captures or self.controls)
+
+    def room_device(self) -> RoomDeviceManifest:
+        """The room device that the entry describes."""
+        return RoomDeviceManifest(
+            name=self.name,
+            kind=self.type,
+            label=self.label or self.name,
+            driver=self.driver,
+            options=self.options,
+            **{field: getattr(self, field) for field in _DESCRIPTION},
+        )
+
+
+_DESCRIPTION = ("streams", "cameras", "captures", "controls", "diagnostics", "watch", "position_m")
+"""Fields of a device entry that describe a room device."""
 
 
 class RoomStream(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -143,23 +177,18 @@ class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         for stream in self.room:
             lines += ["", "[[room]]", *_table(stream)]
         for device in self.devices:
-            lines += ["", "[[devices]]"]
-            lines += [f"{key} = {_toml(getattr(device, key))}" for key in ("name", "type", "driver", "label")]
-            if device.room:
-                lines.append(f"room = {_toml(device.room)}")
-            if device.options:
-                lines.append("[devices.options]")
-                lines += [f"{_toml(key)} = {_toml(value)}" for key, value in device.options.items()]
-            for rule in device.interlocks:
-                lines += ["", "[[devices.interlocks]]", *_table(rule)]
+            lines += ["", "[[devices]]", *_device_table(device)]
         private_file.write(folder / CONFIG_FILE, ("\n".join(lines) + "\n").encode())
 
     def with_manual_settings(self, previous: "AgentConfig") -> "AgentConfig":
         """This configuration with the settings of ``previous`` that ``enroll`` has no option for."""
         interlocks = {device.name: device.interlocks for device in previous.devices}
+        devices = [replace(device, interlocks=interlocks.get(device.name, ())) for device in self.devices]
+        names = {device.name for device in devices}
+        devices += [device for device in previous.devices if device.described and device.name not in names]
         return replace(
             self,
-            devices=tuple(replace(device, interlocks=interlocks.get(device.name, ())) for device in self.devices),
+            devices=tuple(devices),
             room=previous.room,
             buffer=previous.buffer,
             allow_unconfined_scripts=previous.allow_unconfined_scripts,
@@ -186,10 +215,44 @@ def _check(config: AgentConfig, path: Path) -> None:
     for device in config.devices:
         if _has_duplicates([rule.name for rule in device.interlocks]):
             raise ConfigError(f"{path}: two interlocks of '{device.name}' have the same device, stream and condition")
+        _check_description(device, path)
+
+
+def _check_description(device: DeviceEntry, path: Path) -> None:
+    """Check the fields that describe a room device."""
+    if not device.described:
+        if device.diagnostics or device.watch:
+            raise ConfigError(f"{path}: '{device.name}' has no `streams` or `cameras` for `diagnostics` and `watch`")
+        return
+    if device.room:
+        raise ConfigError(
+            f"{path}: the room '{device.room}' describes '{device.name}'; remove `room`, or the description here"
+        )
+    if not device.driver:
+        raise ConfigError(f"{path}: '{device.name}' needs `driver`; `python -m device_agent devices` lists the drivers")
+    try:
+        rooms.check_device(device.room_device())
+    except ProtocolError as error:
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def _has_duplicates(names: Sequence[str]) -> bool:
     return len(set(names)) != len(names)
+
+
+def _device_table(device: DeviceEntry) -> list[str]:
+    lines = [f"{key} = {_toml(getattr(device, key))}" for key in ("name", "type", "driver", "label")]
+    if device.room:
+        lines.append(f"room = {_toml(device.room)}")
+    if device.described:
+        description = {field: getattr(device, field) for field in _DESCRIPTION}
+        lines += [f"{key} = {_toml(value)}" for key, value in msgspec.to_builtins(description).items() if value]
+    if device.options:
+        lines.append("[devices.options]")
+        lines += [f"{_toml(key)} = {_toml(value)}" for key, value in device.options.items()]
+    for rule in device.interlocks:
+        lines += ["", "[[devices.interlocks]]", *_table(rule)]
+    return lines
 
 
 def _table(entry: Struct) -> list[str]:
@@ -199,7 +262,8 @@ def _table(entry: Struct) -> list[str]:
 def _toml(value: Any) -> str:
     """A TOML value. Equals JSON, except for tables, U+007F and characters that JSON escapes as two surrogates."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_toml(key)} = {_toml(each)}" for key, each in value.items()) + "}"
-    if isinstance(value, list):
+        entries = ((key, each) for key, each in value.items() if each is not None)  # TOML has no null
+        return "{" + ", ".join(f"{_toml(key)} = {_toml(each)}" for key, each in entries) + "}"
+    if isinstance(value, list | tuple):
         return "[" + ", ".join(_toml(item) for item in value) + "]"
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -92,11 +92,19 @@ def add_search_path(folder: Path) -> None:
 
 
 def type_of(entry: DeviceEntry) -> robot_type.RobotType:
-    """The robot type of a device entry; for a room device, derived from the room's manifest.
+    """The robot type of a device entry; for a room device, derived from its description.
 
     Raises:
-        ConfigError: The type or room is unknown, or the room has no device of this name and type.
+        ConfigError: The type or room is unknown, the room has no device of this name and type, or a room device has
+            the type of a robot.
     """
+    if entry.described:
+        if entry.type in TYPES.folders():
+            raise ConfigError(
+                f"'{entry.name}' has streams or controls of its own, but '{entry.type}' is a robot type; "
+                'use another `type`, for example "sensor"'
+            )
+        return entry.room_device().robot_type()
     if not entry.room:
         return TYPES.load(entry.type)
     manifest = ROOMS.load(entry.room)
@@ -110,12 +118,19 @@ def type_of(entry: DeviceEntry) -> robot_type.RobotType:
 
 
 def room_device_of(entry: DeviceEntry) -> room.RoomDeviceManifest | None:
-    """The room manifest's part about a device entry, or ``None`` for a robot.
+    """The description of a room device, from its entry or its room's manifest; ``None`` for a robot.
 
     Raises:
         ConfigError: The room is unknown.
     """
+    if entry.described:
+        return entry.room_device()
     return ROOMS.load(entry.room).device(entry.name) if entry.room else None
+
+
+def downloadable(entry: DeviceEntry) -> bool:
+    """Whether the type of a device is a robot type, which the cloud may provide."""
+    return not entry.room and not entry.described
 
 
 def entries_of(name: str) -> list[DeviceEntry]:
@@ -144,7 +159,7 @@ def enrolled_devices(configuration: AgentConfig) -> list[dict[str, str]]:
     entries = []
     known = TYPES.folders()
     for device in configuration.devices:
-        if not device.room and device.type not in known:
+        if downloadable(device) and device.type not in known:
             label = device.label or device.name
             entries.append({"name": device.name, "kind": "robot", "robot_type": device.type, "label": label})
             continue

@@ -5,7 +5,7 @@ Built-in plug-ins are imported on demand, so that an agent needs only the librar
 
 import importlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Generic, TypeVar, cast
 
@@ -21,12 +21,14 @@ class PlugIns(Generic[Factory]):
         group: Entry point group; an entry point is a factory.
         built_in: Name → module with the factory ``create``.
         error: Exception for unknown names.
+        extras: Name → extra of the agent's package that installs the libraries of a built-in plug-in.
     """
 
     label: str
     group: str
     built_in: Mapping[str, str]
     error: type[Exception]
+    extras: Mapping[str, str] = field(default_factory=dict)
 
     def names(self) -> tuple[str, ...]:
         """All names that ``load`` takes, sorted."""
@@ -44,8 +46,16 @@ class PlugIns(Generic[Factory]):
             for point in entry_points(group=self.group):
                 if point.name == name:
                     return cast("Factory", point.load())
-        except (ImportError, AttributeError) as error:
+        except ModuleNotFoundError as error:
+            if name not in self.extras:
+                raise self._unloadable(name, error) from error
             raise self.error(
-                f"{self.label} '{name}' cannot be loaded: {error}; check that its package is installed"
+                f"{self.label} '{name}' needs {error.name}, which is not installed; "
+                f"run `pip install 'telescope-agent[{self.extras[name]}]'`"
             ) from error
+        except (ImportError, AttributeError) as error:
+            raise self._unloadable(name, error) from error
         raise self.error(f"no {self.label} '{name}'; there are: {', '.join(self.names())}")
+
+    def _unloadable(self, name: str, error: Exception) -> Exception:
+        return self.error(f"{self.label} '{name}' cannot be loaded: {error}; check that its package is installed")

@@ -16,11 +16,17 @@ __all__ = ["GROUP", "Factory", "load", "names"]
 
 GROUP = "telescope.sensors"
 _BUILT_IN: Mapping[str, str] = {
+    "modbus": "device_agent.sensors.modbus",
     "mujoco": "device_agent.sensors.mujoco",
     "perception": "device_agent.sensors.perception",
     "ros": "device_agent.sensors.ros",
+    "serial": "device_agent.sensors.serial",
+    "tasmota": "device_agent.sensors.home_mqtt.tasmota",
+    "zigbee2mqtt": "device_agent.sensors.home_mqtt.zigbee2mqtt",
 }
 """Name → module that defines ``create``."""
+_EXTRAS: Mapping[str, str] = {"modbus": "modbus", "serial": "serial"}
+"""Name → extra of the agent's package with the libraries of the driver."""
 
 
 class Factory(Protocol):
@@ -53,4 +59,6 @@ def load(name: str) -> Factory:
     return _PLUG_INS.load(name)
 
 
-_PLUG_INS: PlugIns[Factory] = PlugIns(label="sensor driver", group=GROUP, built_in=_BUILT_IN, error=SensorError)
+_PLUG_INS: PlugIns[Factory] = PlugIns(
+    label="sensor driver", group=GROUP, built_in=_BUILT_IN, error=SensorError, extras=_EXTRAS
+)

@@ -45,7 +45,7 @@ def examine(store: IdentityStore) -> Iterator[Finding]:
     yield from _run("scripts", partial(machine.scripts, allow_unconfined=config.allow_unconfined_scripts))
     yield from _run("renderer", partial(devices.renderer, config))
     for entry in config.devices:
-        yield from _run(f"device {entry.name}", partial(devices.device, entry))
+        yield from _run(f"device {entry.name}", partial(devices.device, entry, store.folder))
     yield from _run("room", partial(devices.room, config))
     yield from _run("server", partial(cloud.examine, store, config))
 

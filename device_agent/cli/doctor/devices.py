@@ -30,12 +30,17 @@ print(backend.name)
 """
 
 
-def device(entry: DeviceEntry) -> Iterator[Finding]:
-    """Check type, model and driver. Builds a simulated device; does not touch a real one, which may be in use."""
+def device(entry: DeviceEntry, home: Path) -> Iterator[Finding]:
+    """Check type, model and driver. Builds a simulated device; does not touch a real one, which may be in use.
+
+    Args:
+        entry: The device.
+        home: The agent's folder.
+    """
     name = f"device {entry.name}"
     try:
         kind = catalogue.type_of(entry)
-        room_device = bootstrap.create_room_device(entry, {})
+        room_device = bootstrap.create_room_device(entry, {}, home=home)
         if room_device is not None:
             yield _room_device(name, kind.type, room_device)
             return
@@ -45,7 +50,7 @@ def device(entry: DeviceEntry) -> Iterator[Finding]:
             driver.connect()
             driver.close()
     except ConfigError as error:
-        yield problem(name, str(error), "Correct the device's `type` or `room` in agent.toml.")
+        yield problem(name, str(error), "Correct the device in agent.toml, or install what its driver needs.")
         return
     except (DriverError, GeometryError) as error:
         yield problem(name, str(error), "Correct the device in agent.toml, or install what its driver needs.")

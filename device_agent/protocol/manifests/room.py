@@ -255,7 +255,7 @@ def parse(text: str) -> Room:
         _check_finite(f"robot '{robot.name}'", (*robot.position_m, robot.yaw_rad))
         _check_inside(f"robot '{robot.name}'", robot.position_m, room.plan)
     for device in room.devices:
-        _check_device(device)
+        check_device(device)
     for zone in room.zones:
         toml.check_box(f"zone '{zone.name}'", zone.lower_m, zone.upper_m)
     for person in room.people:
@@ -265,7 +265,12 @@ def parse(text: str) -> Room:
     return room
 
 
-def _check_device(device: RoomDeviceManifest) -> None:
+def check_device(device: RoomDeviceManifest) -> None:
+    """Check that the fields of a device do not contradict each other.
+
+    Raises:
+        ProtocolError: They do; the message names device and field.
+    """
     where = f"device '{device.name}'"
     _check_finite(where, device.position_m)
     _check_names(f"streams of {where}", [stream.name for stream in device.streams])

@@ -29,7 +29,13 @@ def all_calls(driver: RoomDriver, entry: RoomDeviceManifest) -> list[Callable[[]
 
 
 class RoomDriverContract:
-    """The suite. ``driver`` supplies an unconnected driver and closes it afterwards."""
+    """The suite. ``driver`` supplies an unconnected driver and closes it afterwards.
+
+    Attributes:
+        resolution: Largest difference between a requested and an applied value, for a device with few values.
+    """
+
+    resolution = 1e-6
 
     @pytest.fixture
     def entry(self) -> RoomDeviceManifest:
@@ -87,7 +93,7 @@ class RoomDriverContract:
         for control in entry.controls:
             middle = (control.lower + control.upper) / 2
             for value in (control.lower, control.upper, middle):
-                assert math.isclose(connected.set(control.name, value), value, abs_tol=1e-6)
+                assert math.isclose(connected.set(control.name, value), value, abs_tol=self.resolution)
         if isinstance(connected, Movable):
             connected.hold()
 

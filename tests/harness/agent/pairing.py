@@ -1,5 +1,6 @@
 """Pairs an agent that a test runs as a process."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from device_agent.config import catalogue
@@ -13,17 +14,24 @@ from tests.harness.cloud.cloud_processes import CloudProcesses
 
 def paired_arm(processes: CloudProcesses, folder: Path, *, transport: str = "mqtt") -> str:
     """Pair an agent with a simulated arm; returns the id of the arm."""
+    arm = DeviceEntry(name="arm", type="ur5")
+    return paired_devices(processes, folder, [arm], transport=transport)["arm"]
+
+
+def paired_devices(
+    processes: CloudProcesses, folder: Path, devices: Sequence[DeviceEntry], *, transport: str = "mqtt"
+) -> dict[str, str]:
+    """Pair an agent with these devices; returns their ids by name."""
     store = IdentityStore(folder)
     key = store.private_key(create=True)
-    arm = DeviceEntry(name="arm", type="ur5")
-    config = AgentConfig(server=processes.url, name="lab", devices=(arm,), transport=transport)
-    config.save(store.folder)
+    AgentConfig(server=processes.url, name="lab", devices=tuple(devices), transport=transport).save(store.folder)
+    config = AgentConfig.load(store.folder)
     api = CloudClient(processes.url, key, CloudClock())
     claim = api.enroll(
         name="lab", software=SOFTWARE, transport=config.transport, devices=catalogue.enrolled_devices(config)
     )
-    device: str = processes.anna.post("/agents/claim", {"code": claim.code}).json()["devices"][0]["id"]
+    claimed = processes.anna.post("/agents/claim", {"code": claim.code}).json()["devices"]
     enrollment = api.enrollment()
     keys = {each["id"]: each["public"] for each in enrollment["keys"]}
     store.save_pairing(Pairing(agent=enrollment["agent"], space=enrollment["space"], account="anna", keys=keys))
-    return device
+    return {device["name"]: device["id"] for device in claimed}

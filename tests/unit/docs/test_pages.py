@@ -31,6 +31,7 @@ EXECUTED = {
     "docs/guides/operate-a-site.md": "tests/integration/docs/test_guides.py",
     "docs/guides/security-on-a-site.md": "tests/integration/docs/test_guides.py",
     "docs/guides/add-a-sensor.md": "tests/unit/device_agent/sensors/test_add_a_sensor.py",
+    "docs/guides/room-devices.md": "tests/unit/device_agent/sensors/test_configured_devices.py",
     "docs/robots/ros.md": "tests/e2e/product/test_ros.py",
     "docs/reference/scripts.md": "tests/e2e/product/test_readme.py",
     "docs/reference/room-and-perception.md": "tests/unit/docs/test_pages.py",
@@ -90,7 +91,7 @@ def test_the_agent_accepts_the_configuration_examples() -> None:
     interlock = block(DOCS / "reference" / "room-and-perception.md", "file", "interlock.toml")
     both = agent.replace("[[room]]", interlock + "\n[[room]]")
     configuration = msgspec.convert(tomllib.loads(both), AgentConfig)
-    assert configuration.devices[1].interlocks[0].stale_s == 2.0
+    assert configuration.devices[-1].interlocks[0].stale_s == 2.0
 
 
 def test_every_setting_of_the_product_is_documented() -> None:

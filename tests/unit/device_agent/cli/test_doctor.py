@@ -116,7 +116,7 @@ def test_missing_features_of_the_machine_are_reported(monkeypatch: pytest.Monkey
     ],
 )
 def test_devices_are_built(entry: DeviceEntry, level: str, named: str) -> None:
-    (finding,) = devices.device(entry)
+    (finding,) = devices.device(entry, Path("/nowhere"))
     assert finding.level == level
     assert named in finding.message
 

@@ -10,8 +10,26 @@ from hypothesis import strategies as st
 from device_agent.config.agent_config import AgentConfig, Buffer, DeviceEntry, HttpPolling, RoomStream
 from device_agent.config.errors import ConfigError
 from device_agent.config.interlock_rule import InterlockRule
+from device_agent.protocol import Stream
+from device_agent.protocol.manifests.robot_type import Diagnostic
+from device_agent.protocol.manifests.room import Control, Watch
 
 ARM = DeviceEntry(name="arm", type="ur5")
+BOILER = DeviceEntry(
+    name="boiler",
+    type="boiler",
+    driver="modbus",
+    streams=(Stream(name="water", rate_hz=0.5),),
+    cameras=(Stream(name="view", rate_hz=1.0),),
+    captures=("image",),
+    controls=(Control(name="target", label="Target", unit="°C", lower=10.0, upper=80.0),),
+    diagnostics=(Diagnostic(stream="water", fields="temperature_c", label="Water", high=90.0),),
+    watch=(Watch(source="water", silent_s=60.0),),
+    position_m=(1.0, 2.0, 0.5),
+    options={"host": "boiler", "streams": {"water": {"temperature_c": {"address": 0}}}},
+)
+DESCRIBED = '[[devices]]\nname = "x"\ntype = "thermometer"\n'
+STREAMS = 'streams = [{ name = "air", rate_hz = 1.0 }]\n'
 MINIMAL = 'server = "http://s"\nname = "n"\n[[devices]]\nname = "arm"\ntype = "ur5"\n'
 INTERLOCK = '[[devices.interlocks]]\ndevice = "a-pir"\nstream = "presence"\nfield = "present"\nequals = true\n'
 RULES = (
@@ -40,6 +58,7 @@ def test_saved_configuration_is_loaded(
         devices=(
             DeviceEntry(name="arm", type="ur5", options=options, interlocks=RULES),
             DeviceEntry(name="other", type="ur5", room="lab", interlocks=RULES[:1]),
+            BOILER,
         ),
         room=(RoomStream(device="abc-lamp", stream="light"),),
         ca="server-ca.pem" if options else "",
@@ -74,6 +93,11 @@ def test_defaults(tmp_path: Path) -> None:
         (INTERLOCK.replace("true", "nan"), "finite"),
         (INTERLOCK + INTERLOCK, "two interlocks of 'arm'"),
         ('[[devices]]\nname = "arm"\ntype = "ur5"\n', "at least one device, each with a unique name"),
+        (DESCRIBED + STREAMS, "'x' needs `driver`; `python -m device_agent devices` lists the drivers"),
+        (f'{DESCRIBED}driver = "modbus"\nroom = "lab"\n{STREAMS}', "the room 'lab' describes 'x'; remove `room`"),
+        (f'{DESCRIBED}driver = "modbus"\n{STREAMS.replace("1.0", "99.0")}', "rate_hz of stream 'air' of device 'x'"),
+        (f'{DESCRIBED}driver = "modbus"\n{STREAMS}watch = [{{ source = "wind" }}]\n', "there is no 'wind'; known: air"),
+        (f'{DESCRIBED}watch = [{{ source = "wind" }}]\n', "'x' has no `streams` or `cameras` for `diagnostics`"),
         (None, "at least one device"),
     ],
 )

@@ -3,12 +3,14 @@
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from device_agent import bootstrap
 from device_agent.__main__ import main
 from device_agent.config import catalogue
-from device_agent.config.agent_config import DeviceEntry
+from device_agent.config.agent_config import AgentConfig, DeviceEntry
 from device_agent.config.errors import ConfigError
+from device_agent.protocol import Stream
 
 ARM = DeviceEntry(name="ur5", type="ur5", room="lab")
 
@@ -52,3 +54,31 @@ def test_furniture_of_the_room_limits_the_arm() -> None:
     assert path.clearance is not None
     assert "table_top" in path.clearance.text
     assert geometry.clearance(home).excess_m > 0
+
+
+THERMOMETER = DeviceEntry(
+    name="air", type="thermometer", driver="modbus", streams=(Stream(name="air", rate_hz=1.0),), options={"host": "h"}
+)
+
+
+def test_a_described_device_is_a_room_device_of_its_type() -> None:
+    kind, device = catalogue.type_of(THERMOMETER), catalogue.room_device_of(THERMOMETER)
+    assert (kind.type, kind.kind, kind.driver, kind.joints) == ("thermometer", "thermometer", "modbus", ())
+    assert device is not None
+    assert (device.name, device.label, device.options) == ("air", "air", {"host": "h"})
+    config = AgentConfig(server="http://s", name="n", devices=(THERMOMETER,))
+    expected = {"name": "air", "kind": "thermometer", "robot_type": "thermometer", "label": "air"}
+    assert catalogue.enrolled_devices(config) == [expected]
+    assert not catalogue.downloadable(THERMOMETER)
+
+
+def test_a_described_device_with_the_type_of_a_robot_is_rejected() -> None:
+    with pytest.raises(ConfigError, match="'air' has streams or controls of its own, but 'ur5' is a robot type"):
+        catalogue.type_of(replace(THERMOMETER, type="ur5"))
+
+
+def test_another_enrollment_keeps_described_devices() -> None:
+    previous = AgentConfig(server="http://s", name="n", devices=(THERMOMETER, ARM))
+    enrolled = AgentConfig(server="http://s", name="n", devices=(replace(ARM, name="other"),))
+    names = [device.name for device in enrolled.with_manual_settings(previous).devices]
+    assert names == ["other", "air"]
