@@ -24,6 +24,7 @@ from device_agent.transports.xmpp import XmppAccess, XmppTransport
 from function_app.entrypoints.xmpp.program import create_gateway
 from function_app.ports.broker_access import Credentials
 from function_app.settings import Settings, Xmpp
+from infra.prosody.configuration import PATH
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person
 from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
@@ -48,11 +49,12 @@ def free_port() -> int:
 
 @dataclass
 class Prosody:
-    """A Prosody process."""
+    """A Prosody process. ``websocket_port``: for browsers."""
 
     process: "subprocess.Popen[str]"
     home: Path
     port: int
+    websocket_port: int
 
     def kill(self) -> None:
         """Kill Prosody and the program that runs it."""
@@ -71,10 +73,11 @@ class Prosody:
 @contextlib.contextmanager
 def start_prosody(home: Path, verify_url: str, *, port: int = 0, more: tuple[str, ...] = ()) -> Iterator[Prosody]:
     home.mkdir(parents=True, exist_ok=True)
+    where = ("--home", str(home), "--port", str(port), "--websocket-port", "0")
     named = ("--domain", DOMAIN, "--verify-url", verify_url, *more)
     with (home / "stderr").open("a") as stderr:
         process = subprocess.Popen(
-            [sys.executable, "-m", "infra.prosody", "--home", str(home), "--port", str(port), *named],
+            [sys.executable, "-m", "infra.prosody", *where, *named],
             cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=stderr,
@@ -85,7 +88,8 @@ def start_prosody(home: Path, verify_url: str, *, port: int = 0, more: tuple[str
                 assert process.stdout is not None
                 line = process.stdout.readline()
                 assert line.startswith("ready xmpp="), f"{line!r} {(home / 'stderr').read_text()}"
-                yield Prosody(process, home, int(line.partition("=")[2]))
+                ports = [int(each.partition("=")[2]) for each in line.split()[1:]]
+                yield Prosody(process, home, *ports)
             finally:
                 if process.poll() is None:
                     process.terminate()
@@ -190,7 +194,8 @@ def open_site(
         listener = stack.enter_context(socket.create_server((HOST, 0)))
         url = f"http://{HOST}:{listener.getsockname()[1]}"
         prosody = stack.enter_context(start_prosody(folder, f"{url}/api/v1/xmpp/verify"))
-        cloud = open_cloud(replace(settings, xmpp=Xmpp(domain=DOMAIN, host=HOST, port=prosody.port)))
+        xmpp = Xmpp(DOMAIN, HOST, prosody.port, f"ws://{HOST}:{prosody.websocket_port}{PATH}")
+        cloud = open_cloud(replace(settings, xmpp=xmpp))
         stack.enter_context(served(cloud, listener))
         site = XmppSite(cloud, prosody, url)
         if gateway:

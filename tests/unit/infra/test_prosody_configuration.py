@@ -18,6 +18,7 @@ def text(tmp_path: Path, **changes: Any) -> str:
         "domain": "lab.example",
         "host": "127.0.0.1",
         "port": 5222,
+        "websocket_port": None,
         "verify_url": "http://127.0.0.1:8080/api/v1/xmpp/verify",
         "certificate": None,
         "key": None,
