@@ -148,12 +148,20 @@ export class XmppServer {
       case "close":
         socket.send(`<close xmlns='${FRAMING}'/>`);
         socket.close();
+        return;
+      default:
+        throw new Error(`unexpected <${element.localName ?? ""}>`);
     }
   }
 
   #message({ socket, jid }: Client, id: string, element: Element): void {
     const [signIn] = element.getElementsByTagNameNS(OURS, "sign-in");
     if (signIn !== undefined) {
+      // As at the gateway.
+      if (!/^[A-Za-z0-9_.-]{1,64}$/.test(id)) {
+        this.reject("a request needs an id");
+        return;
+      }
       const status = this.#tokens.delete(signIn.getAttribute("token") ?? "") ? this.signInStatus : 401;
       this.signIns.push(status);
       const problem = status < 400 ? "" : JSON.stringify({ detail: "Sign in again." });

@@ -32,6 +32,7 @@ export class XmppStream {
   readonly #credentials: XmppCredentials;
   readonly #lost: (stream: XmppStream, reason: string) => void;
   readonly #requests = new Map<string, Waiting>();
+  #signIns = 0;
   #gateway = "";
   #onGateway: () => void = () => undefined;
   #fail: (reason: Error) => void = () => undefined;
@@ -77,7 +78,8 @@ export class XmppStream {
 
   /** Starts the session at the gateway, or renews its token. Rejects if the gateway refuses it. */
   async signIn(token: string): Promise<void> {
-    const id = this.#connection.getUniqueId("sign-in");
+    this.#signIns += 1;
+    const id = `sign-in-${this.#signIns}`;
     await new Promise<void>((resolve, reject) => {
       this.#requests.set(id, { resolve, reject });
       this.#send(this.#message(id).c("sign-in", { xmlns: NAMESPACE, token }));
@@ -92,6 +94,7 @@ export class XmppStream {
   }
 
   close(): void {
+    if (this.#ended) return;
     this.#ended = true;
     clearInterval(this.#pingTimer);
     this.#connection.disconnect();
