@@ -22,7 +22,10 @@ def main() -> int:
     try:
         host = programs.address(arguments.host)
         binary = configuration.binary()
-        asked = [(host, arguments.port), *([] if arguments.websocket_port is None else [(host, arguments.websocket_port)])]
+        asked = [
+            (host, arguments.port),
+            *([] if arguments.websocket_port is None else [(host, arguments.websocket_port)]),
+        ]
         ports = programs.free_ports(*asked)
         configuration.write(
             home,
@@ -54,9 +57,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--port", type=int, default=5222, help="for clients; 0 selects a free port (default: %(default)s)"
     )
-    parser.add_argument(
-        "--websocket-port", type=int, help="for browsers; 0 selects a free port (default: no browsers)"
-    )
+    parser.add_argument("--websocket-port", type=int, help="for browsers; 0 selects a free port (default: no browsers)")
     parser.add_argument(
         "--certificate", type=Path, help="of the domain, with its chain (PEM); required except on loopback"
     )

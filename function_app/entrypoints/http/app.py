@@ -235,7 +235,9 @@ class _Addresses:
 class _Headers:
     """Adds headers to every response, and returns a 500 response for unhandled errors. Plain ASGI, for speed."""
 
-    def __init__(self, app: ASGIApp, *, clock: Clock, metrics: Metrics, websocket_urls: tuple[str, ...], secure: bool) -> None:
+    def __init__(
+        self, app: ASGIApp, *, clock: Clock, metrics: Metrics, websocket_urls: tuple[str, ...], secure: bool
+    ) -> None:
         self._app = app
         self._clock = clock
         self._metrics = metrics

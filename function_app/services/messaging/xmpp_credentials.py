@@ -136,7 +136,9 @@ class XmppCredentials:
         """
         self._require()
         if not self._browsers:
-            detail = "The XMPP server accepts no browsers. Send setpoints over MQTT, or set TELESCOPE_XMPP_WEBSOCKET_URL."
+            detail = (
+                "The XMPP server accepts no browsers. Send setpoints over MQTT, or set TELESCOPE_XMPP_WEBSOCKET_URL."
+            )
             raise Problem("xmpp-unavailable", 409, "No XMPP server for browsers", detail)
         now_ms = self._clock.now_ms()
         lifetime_s = caller.lifetime_s(ACCESS_S, now_ms)

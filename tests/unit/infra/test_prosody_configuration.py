@@ -38,6 +38,26 @@ def test_encryption_is_required_except_on_loopback(tmp_path: Path) -> None:
     assert '"tls"' in secure
 
 
+def test_browsers_are_served_only_on_request_and_with_the_encryption_of_the_others(tmp_path: Path) -> None:
+    without = text(tmp_path)
+    assert "websocket" not in without
+    assert "http" not in without.replace("http://127.0.0.1:8080", "").replace("https://prosody", "")
+    plain = text(tmp_path, websocket_port=5280)
+    assert '"websocket"' in plain
+    assert "http_ports = { 5280 }\n" in plain
+    assert "https_ports = {}\n" in plain
+    assert 'http_interfaces = { "127.0.0.1" }\n' in plain
+    assert "http_cors_override = { websocket = { enabled = false } }\n" in plain
+    for name in ("c.pem", "k.pem"):
+        (tmp_path / name).touch()
+    files = {"certificate": tmp_path / "c.pem", "key": tmp_path / "k.pem"}
+    secure = text(tmp_path, host="192.168.1.5", websocket_port=5281, **files)
+    assert "https_ports = { 5281 }\n" in secure
+    assert "http_ports = {}\n" in secure
+    assert 'https_interfaces = { "192.168.1.5" }\n' in secure
+    assert f'https_ssl = {{ certificate = "{tmp_path}/domain.crt", key = "{tmp_path}/domain.key" }}\n' in secure
+
+
 @pytest.mark.parametrize("changes", [{"host": "0.0.0.0"}, {"host": "192.168.1.5"}, {"key": Path("k.pem")}])  # noqa: S104 (rejected)
 def test_a_missing_certificate_is_rejected(tmp_path: Path, changes: dict[str, Any]) -> None:
     with pytest.raises(ConfigurationError, match="certificate"):
