@@ -35,9 +35,9 @@ class SettingsError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Folders, ports and options. MQTT uses the port after ``port``, MQTT over WebSocket the next, then XMPP and XMPP
-    over WebSocket.
+    """Folders, ports and options. MQTT uses the port after ``port``, MQTT over WebSocket the next, then XMPP twice.
 
+    The second XMPP port is for browsers (WebSocket).
     ``tls``: page, API and broker use TLS only, with the certificates in ``tls_home``. ``certificates``: the broker also
     requires a client certificate of each agent. ``room``: the simulated room to start; empty for a single arm.
     """

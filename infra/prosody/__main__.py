@@ -1,7 +1,8 @@
 """``python -m infra.prosody``: run Prosody until SIGTERM or SIGINT.
 
-Prints ``ready xmpp=PORT`` (and ``websocket=PORT``) once it accepts connections. Exit codes: 0 on a signal; 3 if the port is in use or Prosody is
-not installed; 2 if an argument or the folder is invalid; 1 if Prosody exits. Errors print one line.
+Prints ``ready xmpp=PORT`` once it accepts connections, with ``websocket=PORT`` if it serves browsers. Exit codes: 0 on a
+signal; 3 if the port is in use or Prosody is not installed; 2 if an argument or the folder is invalid; 1 if Prosody
+exits. Errors print one line.
 """
 
 import argparse
@@ -22,11 +23,8 @@ def main() -> int:
     try:
         host = programs.address(arguments.host)
         binary = configuration.binary()
-        asked = [
-            (host, arguments.port),
-            *([] if arguments.websocket_port is None else [(host, arguments.websocket_port)]),
-        ]
-        ports = programs.free_ports(*asked)
+        asked = [port for port in (arguments.port, arguments.websocket_port) if port is not None]
+        ports = programs.free_ports(*((host, port) for port in asked))
         configuration.write(
             home,
             domain=arguments.domain,

@@ -149,8 +149,7 @@ def _websocket(folder: Path, domain: str, host: str, port: int, *, encrypted: bo
         f"{unused}_ports = {{}}",
         "-- Browsers name the host of the URL, which need not be the domain.",
         f"http_default_host = {_lua(domain)}",
-        "-- A page of any site can open a WebSocket; it signs in with a password, never with a cookie. Other requests of",
-        "-- foreign pages are refused.",
+        "-- CORS does not apply to a WebSocket, which signs in with a password and never with a cookie.",
         "http_cors_override = { websocket = { enabled = false } }",
     ]
     if encrypted:

@@ -30,7 +30,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         caller="account or agent",
     )
     async def xmpp_credentials(request: Request) -> Response:
-        """Returns credentials for an agent with transport ``xmpp``, for an XMPP client, or for setpoints under a lease."""
+        """Returns credentials for an agent with transport ``xmpp``, an XMPP client, or setpoints under a lease."""
         payload: Any = await read(request, schemas.XmppCredentialsRequest)
         space: str | None = None
         token = websocket_url = ""
