@@ -1,7 +1,7 @@
 """``python -m infra.prosody``: run Prosody until SIGTERM or SIGINT.
 
-Prints ``ready xmpp=PORT`` once it accepts connections, with ``websocket=PORT`` if it serves browsers. Exit codes: 0 on a
-signal; 3 if the port is in use or Prosody is not installed; 2 if an argument or the folder is invalid; 1 if Prosody
+Prints ``ready xmpp=PORT`` once it accepts connections, with ``websocket=PORT`` if it serves browsers. Exit codes: 0 on
+a signal; 3 if the port is in use or Prosody is not installed; 2 if an argument or the folder is invalid; 1 if Prosody
 exits. Errors print one line.
 """
 

@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -284,10 +284,15 @@ class _Line:
 
 
 class XmppClient:
-    """A generic XMPP client; a context manager that disconnects."""
+    """A generic XMPP client; a context manager that disconnects.
+
+    Attributes:
+        on_message: Called with each message in the thread of the client; a test may replace it.
+    """
 
     def __init__(self, port: int, user: str, password: str, *, resource: str = "test") -> None:
         self.messages: list[Element] = []
+        self.on_message: Callable[[Element], None] = lambda _: None
         self.presences: list[Element] = []
         self.trouble: OSError | None = None
         self._login = Login(HOST, port, f"{user}@{DOMAIN}/{resource}", password)
@@ -297,7 +302,7 @@ class XmppClient:
         self.opened = self._run(self._open())
 
     async def _open(self) -> bool:
-        self.stream = Stream(self._login, message=self.messages.append, presence=self.presences.append)
+        self.stream = Stream(self._login, message=self._receive, presence=self.presences.append)
         try:
             await self.stream.open()
         except OSError as error:
@@ -305,6 +310,10 @@ class XmppClient:
             return False
         self._staying = asyncio.create_task(self.stream.stay())
         return True
+
+    def _receive(self, stanza: "Element") -> None:
+        self.messages.append(stanza)
+        self.on_message(stanza)
 
     @property
     def ended(self) -> bool:
@@ -338,10 +347,11 @@ class XmppClient:
 
 
 @contextlib.contextmanager
-def start_xmpp_processes(folder: Path) -> Iterator[CloudProcesses]:
-    """Cloud processes with Prosody and an XMPP gateway."""
+def start_xmpp_processes(folder: Path, more: Mapping[str, str] | None = None) -> Iterator[CloudProcesses]:
+    """Cloud processes with these additional settings, Prosody and an XMPP gateway."""
     port = free_port()
     settings = {"TELESCOPE_XMPP_DOMAIN": DOMAIN, "TELESCOPE_XMPP_HOST": HOST, "TELESCOPE_XMPP_PORT": str(port)}
+    settings |= more or {}
     with start_cloud_processes("mosquitto", folder, settings) as processes:
         end = ProsodyEndpoint(folder / "prosody", f"{processes.url}/api/v1/xmpp/verify", port, processes.stack)
         processes.endpoints["xmpp"] = end
