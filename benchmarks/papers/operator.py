@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
+import httpx
+
 from benchmarks.baseline.product import TIMEOUT_S
 from benchmarks.papers.exchanges import JOINTS
 from device_agent.protocol import JointTarget, Setpoint, codec, topics
@@ -22,7 +24,9 @@ from device_agent.protocol.xmpp.stream import Login
 from device_agent.transports.xmpp import XmppAccess
 from function_app.ports.broker_access import Credentials
 from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import API, Person
 from tests.harness.cloud.cloud_processes import CloudProcesses
+from tests.harness.cloud.polling import Site
 from tests.harness.network.brokers import HOST, Client, Message, wait_until
 from tests.harness.network.xmpp import XmppRobot
 from tests.harness.network.xmpp_operator import XmppOperator
@@ -82,8 +86,8 @@ class _Through:
 class _XmppRobot(XmppRobot):
     """A robot over XMPP behind the network."""
 
-    def __init__(self, cloud: Any, port: int) -> None:
-        super().__init__(cloud, ("arm",))
+    def __init__(self, site: Site, port: int) -> None:
+        super().__init__(site, ("arm",))
         self.answering = _Answering()
         self._port = port
 
@@ -97,6 +101,19 @@ class _XmppRobot(XmppRobot):
             self.answering.setpoint(self)
         else:
             super().handle(message)
+
+
+class _Account:
+    """An account at the server that knows Prosody."""
+
+    def __init__(self, site: Site, person: Person) -> None:
+        self._site = site
+        self.account = person.account
+        self.token = person.token
+
+    def post(self, path: str, body: Any) -> httpx.Response:
+        headers = {"Authorization": f"Bearer {self.token}"}
+        return self._site.request("POST", API + path, json=body, headers=headers)
 
 
 class Path:
@@ -144,9 +161,11 @@ def over_xmpp(stack: contextlib.ExitStack, ports: Ports, processes: CloudProcess
     """An operator over XMPP; the robot uses XMPP or MQTT."""
     xmpp = ports[processes.endpoints["xmpp"].port]
     broker = ports[processes.broker.port]
-    robot = _XmppRobot(processes.cloud, xmpp) if robot_over_xmpp else _MqttRobot(processes.cloud, broker)
+    site = Site(processes.url)
+    stack.callback(site.close)
+    robot = _XmppRobot(site, xmpp) if robot_over_xmpp else _MqttRobot(processes.cloud, broker)
     lease = _online(stack, robot, processes)
-    operator = stack.enter_context(XmppOperator(xmpp, processes.anna, resource=robot.id))
+    operator = stack.enter_context(XmppOperator(xmpp, _Account(site, processes.anna), resource=robot.id))
     if operator.sign_in().status != 204:  # noqa: PLR2004 (signed in)
         raise RuntimeError("the gateway rejects the operator")
     answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()

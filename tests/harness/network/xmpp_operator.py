@@ -2,13 +2,23 @@
 
 import itertools
 import json
-from typing import Any
+from typing import Any, Protocol
+
+import httpx
 
 from device_agent.protocol.xmpp import jids, operator_stanzas, stanzas
 from device_agent.protocol.xmpp.operator_stanzas import Answer
-from tests.harness.cloud.cloud import Person
 from tests.harness.network.brokers import wait_until
 from tests.harness.network.xmpp import XmppClient
+
+
+class Account(Protocol):
+    """A signed-in account."""
+
+    account: str
+    token: str
+
+    def post(self, path: str, body: Any) -> httpx.Response: ...
 
 
 class XmppOperator(XmppClient):
@@ -21,7 +31,7 @@ class XmppOperator(XmppClient):
         resource: Resource of the JID.
     """
 
-    def __init__(self, port: int, person: Person, *, token: str = "", resource: str = "operator") -> None:
+    def __init__(self, port: int, person: Account, *, token: str = "", resource: str = "operator") -> None:
         issued = person.post("/xmpp/credentials", {"purpose": "view"}).json()
         super().__init__(port, person.account, issued["password"], resource=resource)
         assert self.opened, self.trouble
