@@ -16,8 +16,8 @@ from tests.harness.network.delay import start_delay
 from tests.harness.network.xmpp import start_xmpp_processes
 
 _ABOUT: Final = """An operator with a lease sends a setpoint; the robot answers it with one telemetry message. Both are
-behind the stated round trip to the server, where broker, Prosody, gateway and functions run. The paper's data passed from
-a sender through Prosody to a receiver; here it also passes the gateway, which gives it to the broker with the
+behind the stated round trip to the server, where broker, Prosody, gateway and functions run. The paper's data passed
+from a sender through Prosody to a receiver; here it also passes the gateway, which gives it to the broker with the
 operator's own rights. Paths of one table run interleaved, so other load on the machine affects all of them."""
 BOTH_XMPP: Final = "operator and robot over XMPP"
 ROBOT_MQTT: Final = "operator over XMPP, robot over MQTT"

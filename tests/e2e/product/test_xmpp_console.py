@@ -40,6 +40,7 @@ NOTE = """() => {
     new MutationObserver(record).observe(document.body, {subtree: true, childList: true, characterData: true});
 }"""
 """Records the state of the connection, which may recover before the test reads it."""
+LOST = "No connection for setpoints: The connection to the XMPP server was lost."
 POST = """([path, body, csrf]) => fetch('/api/v1' + path, {method: 'POST', body: JSON.stringify(body),
     headers: {'Content-Type': 'application/json', 'X-CSRF-Token': csrf}}).then(r => r.status)"""
 
@@ -123,7 +124,7 @@ def test_a_closed_socket_stops_the_motion_and_the_page_says_so(browser: Browser,
 
         assert stopped_in_time(attempt)
         noted = page.evaluate("() => window.noted")
-        assert any("No connection for setpoints: The connection to the XMPP server was lost." in text for text in noted), set(noted)
+        assert any(LOST in text for text in noted), set(noted)
         assert any("XMPP, not connected" in text for text in noted), set(noted)
 
         # The same transport carries the next input; nothing has continued on MQTT.
