@@ -194,7 +194,8 @@ def open_site(
         listener = stack.enter_context(socket.create_server((HOST, 0)))
         url = f"http://{HOST}:{listener.getsockname()[1]}"
         prosody = stack.enter_context(start_prosody(folder, f"{url}/api/v1/xmpp/verify"))
-        xmpp = Xmpp(DOMAIN, HOST, prosody.port, f"ws://{HOST}:{prosody.websocket_port}{PATH}")
+        websocket_url = f"ws://{HOST}:{prosody.websocket_port}{PATH}"
+        xmpp = Xmpp(domain=DOMAIN, host=HOST, port=prosody.port, websocket_url=websocket_url)
         cloud = open_cloud(replace(settings, xmpp=xmpp))
         stack.enter_context(served(cloud, listener))
         site = XmppSite(cloud, prosody, url)
