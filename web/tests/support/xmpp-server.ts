@@ -116,7 +116,8 @@ export class XmppServer {
   #receive(client: Client, element: Element): void {
     const { socket } = client;
     const id = element.getAttribute("id") ?? "";
-    switch (element.localName) {
+    const name: string = element.localName ?? "";
+    switch (name) {
       case "open":
         socket.send(`<open xmlns='${FRAMING}' from='${DOMAIN}' id='${randomUUID()}' version='1.0'/>`);
         socket.send(
@@ -150,7 +151,7 @@ export class XmppServer {
         socket.close();
         return;
       default:
-        throw new Error(`unexpected <${element.localName ?? ""}>`);
+        throw new Error(`unexpected <${name}>`);
     }
   }
 
