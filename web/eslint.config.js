@@ -27,7 +27,7 @@ export default tseslint.config(
   },
   {
     // Models and the shared client do not use the DOM, so that they run and are tested without a page.
-    files: ["src/features/*/model/**", "src/shared/{api,lib,mqtt}/**"],
+    files: ["src/features/*/model/**", "src/shared/{api,lib,mqtt,xmpp}/**"],
     rules: {
       "no-restricted-globals": ["error", ...pageNames],
       "no-restricted-imports": ["error", { patterns: ["preact", "preact/*", "three", "three/*", "uplot"] }],

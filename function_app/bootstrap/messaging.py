@@ -49,6 +49,7 @@ class MessagingServices(HealthServices):
             devices=self.devices,
             clock=self.clock,
             domain=self.settings.xmpp.domain,
+            browsers=bool(self.settings.xmpp.websocket_url),
         )
 
     @cached_property

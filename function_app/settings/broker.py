@@ -65,11 +65,13 @@ class Xmpp:
         domain: Part after the ``@`` of every address; empty where there is no XMPP server.
         host: Address for agents and for the XMPP gateway.
         port: Port for client connections.
+        websocket_url: Address for browsers (RFC 7395); empty: browsers send setpoints over MQTT only.
     """
 
     domain: str = ""
     host: str = "127.0.0.1"
     port: int = 5222
+    websocket_url: str = ""
 
 
 def read_broker(env: Environment) -> tuple[Broker, IotBus | EventGridBus | None]:
@@ -90,11 +92,27 @@ def read_broker(env: Environment) -> tuple[Broker, IotBus | EventGridBus | None]
 
 def read_xmpp(env: Environment, host: str) -> Xmpp:
     """The XMPP server, by default at ``host``."""
+    domain = env.matching("TELESCOPE_XMPP_DOMAIN", "", _DOMAIN, "a domain in lower case")
+    websocket_url = _read_xmpp_websocket_url(env)
+    if websocket_url and not domain:
+        raise SettingsError("TELESCOPE_XMPP_WEBSOCKET_URL is set; set TELESCOPE_XMPP_DOMAIN too")
     return Xmpp(
-        domain=env.matching("TELESCOPE_XMPP_DOMAIN", "", _DOMAIN, "a domain in lower case"),
+        domain=domain,
         host=env.host("TELESCOPE_XMPP_HOST", host),
         port=env.port("TELESCOPE_XMPP_PORT", 5222),
+        websocket_url=websocket_url,
     )
+
+
+def _read_xmpp_websocket_url(env: Environment) -> str:
+    """The address for browsers. It is part of the content security policy, which names it exactly."""
+    name = "TELESCOPE_XMPP_WEBSOCKET_URL"
+    if not env.get(name):
+        return ""
+    url = env.url(name, "", ("wss", "ws"))
+    if any(letter in url for letter in "?#@"):
+        raise env.invalid(name, "an address without user, query and fragment")
+    return url
 
 
 def _read_bus(env: Environment) -> IotBus | EventGridBus | None:

@@ -99,10 +99,10 @@ class LocalStack:
             (config.port, "page"),
             (config.mqtt_port, "MQTT"),
             (config.websocket_port, "MQTT over WebSocket"),
-            *([(config.xmpp_port, "XMPP")] if config.xmpp else []),
+            *([(config.xmpp_port, "XMPP"), (config.xmpp_websocket_port, "XMPP over WebSocket")] if config.xmpp else []),
         ):
             if port_in_use(config.host, port):
-                count = "three" if config.xmpp else "two"
+                count = "four" if config.xmpp else "two"
                 raise StartError(
                     f"port {port} ({label}) is in use; set TELESCOPE_PORT (the next {count} are used, too)"
                 )
@@ -144,6 +144,7 @@ class LocalStack:
         config = self._settings
         verify_url = f"{config.url}/api/v1/xmpp/verify"
         address = ["--home", str(config.home / "prosody"), "--host", config.host, "--port", str(config.xmpp_port)]
+        address += ["--websocket-port", str(config.xmpp_websocket_port)]
         return ["-m", "infra.prosody", *address, "--domain", settings.XMPP_DOMAIN, "--verify-url", verify_url]
 
     def _run(self, name: str, *arguments: str) -> SupervisedProcess:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, cast
 
 from infra import files
+from infra.prosody.configuration import PATH
 
 ACCOUNT = "demo"
 """The account of the first sign-in link; it is the administrator unless the environment names others."""
@@ -34,8 +35,9 @@ class SettingsError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Folders, ports and options. MQTT uses the port after ``port``, MQTT over WebSocket the next, then XMPP.
+    """Folders, ports and options. MQTT uses the port after ``port``, MQTT over WebSocket the next, then XMPP twice.
 
+    The second XMPP port is for browsers (WebSocket).
     ``tls``: page, API and broker use TLS only, with the certificates in ``tls_home``. ``certificates``: the broker also
     requires a client certificate of each agent. ``room``: the simulated room to start; empty for a single arm.
     """
@@ -63,6 +65,11 @@ class Settings:
     def xmpp_port(self) -> int:
         """XMPP, if enabled."""
         return self.port + 3
+
+    @property
+    def xmpp_websocket_port(self) -> int:
+        """XMPP over WebSocket, if enabled."""
+        return self.port + 4
 
     @property
     def tls_home(self) -> Path:
@@ -97,9 +104,14 @@ class Settings:
             "TELESCOPE_XMPP_DOMAIN": XMPP_DOMAIN if self.xmpp else "",
             "TELESCOPE_XMPP_HOST": self.host,
             "TELESCOPE_XMPP_PORT": str(self.xmpp_port),
+            "TELESCOPE_XMPP_WEBSOCKET_URL": self._xmpp_websocket_url,
             "PYTHONUNBUFFERED": "1",
             **(self._tls_environment() if self.tls else {}),
         }
+
+    @property
+    def _xmpp_websocket_url(self) -> str:
+        return f"ws://{self.host}:{self.xmpp_websocket_port}{PATH}" if self.xmpp else ""
 
     def _tls_environment(self) -> dict[str, str]:
         certificate, key = self.certificate

@@ -1,7 +1,8 @@
 """``python -m infra.prosody``: run Prosody until SIGTERM or SIGINT.
 
-Prints ``ready xmpp=PORT`` once it accepts connections. Exit codes: 0 on a signal; 3 if the port is in use or Prosody is
-not installed; 2 if an argument or the folder is invalid; 1 if Prosody exits. Errors print one line.
+Prints ``ready xmpp=PORT`` once it accepts connections, with ``websocket=PORT`` if it serves browsers. Exit codes: 0 on
+a signal; 3 if the port is in use or Prosody is not installed; 2 if an argument or the folder is invalid; 1 if Prosody
+exits. Errors print one line.
 """
 
 import argparse
@@ -22,12 +23,14 @@ def main() -> int:
     try:
         host = programs.address(arguments.host)
         binary = configuration.binary()
-        (port,) = programs.free_ports((host, arguments.port))
+        asked = [port for port in (arguments.port, arguments.websocket_port) if port is not None]
+        ports = programs.free_ports(*((host, port) for port in asked))
         configuration.write(
             home,
             domain=arguments.domain,
             host=host,
-            port=port,
+            port=ports[0],
+            websocket_port=ports[1] if ports[1:] else None,
             verify_url=arguments.verify_url,
             certificate=arguments.certificate,
             key=arguments.key,
@@ -38,8 +41,9 @@ def main() -> int:
     if user.notice:
         programs.print_error(user.notice)
     command = [binary, "--config", f"./{configuration.CONFIGURATION_FILE}", "-F"]
-    server = programs.Server("prosody", command, host, (port,), folder=home)
-    return programs.supervise(server, ready=f"ready xmpp={port}", user=user.ids)
+    server = programs.Server("prosody", command, host, tuple(ports), folder=home)
+    named = " ".join(f"{name}={port}" for name, port in zip(("xmpp", "websocket"), ports, strict=False))
+    return programs.supervise(server, ready=f"ready {named}", user=user.ids)
 
 
 def _arguments() -> argparse.Namespace:
@@ -51,6 +55,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--port", type=int, default=5222, help="for clients; 0 selects a free port (default: %(default)s)"
     )
+    parser.add_argument("--websocket-port", type=int, help="for browsers; 0 selects a free port (default: no browsers)")
     parser.add_argument(
         "--certificate", type=Path, help="of the domain, with its chain (PEM); required except on loopback"
     )

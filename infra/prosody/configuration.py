@@ -11,6 +11,8 @@ from infra.service_user import ServiceUser
 
 CONFIGURATION_FILE = "prosody.cfg.lua"
 PACKAGE = "prosody"
+PATH = "/xmpp-websocket"
+"""Path of the WebSocket, the default of Prosody."""
 _MODULE = Path(__file__).with_name("mod_auth_telescope.lua")
 _CERTIFICATE_FILE, _KEY_FILE = "domain.crt", "domain.key"
 """Copies of the TLS files: Prosody's user cannot read the originals."""
@@ -43,6 +45,7 @@ def write(
     domain: str,
     host: str,
     port: int,
+    websocket_port: int | None,
     verify_url: str,
     certificate: Path | None,
     key: Path | None,
@@ -55,6 +58,7 @@ def write(
         domain: The domain of every JID.
         host: The address to listen on.
         port: Port for clients.
+        websocket_port: Port for browsers (RFC 7395); ``None``: no browsers.
         verify_url: URL by which the functions authenticate clients.
         certificate: Of the domain, with its chain; required unless ``host`` is a loopback address.
         key: Its private key.
@@ -69,7 +73,15 @@ def write(
     # Prosody makes paths absolute, but its user has no access to the folders above. This link does not need it (Linux).
     folder = Path("/proc/self/cwd") if user.differs else home.absolute()
     encrypted = certificate is not None
-    text = configuration(folder, domain=domain, host=host, port=port, verify_url=verify_url, encrypted=encrypted)
+    text = configuration(
+        folder,
+        domain=domain,
+        host=host,
+        port=port,
+        websocket_port=websocket_port,
+        verify_url=verify_url,
+        encrypted=encrypted,
+    )
     home.mkdir(parents=True, exist_ok=True, mode=0o700)
     (home / _CERTIFICATE_FOLDER).mkdir(exist_ok=True)
     contents = {CONFIGURATION_FILE: text.encode(), _MODULE.name: _MODULE.read_bytes()}
@@ -80,7 +92,9 @@ def write(
     user.own([home, home / _CERTIFICATE_FOLDER, *(home / name for name in contents)])
 
 
-def configuration(folder: Path, *, domain: str, host: str, port: int, verify_url: str, encrypted: bool) -> str:
+def configuration(
+    folder: Path, *, domain: str, host: str, port: int, websocket_port: int | None, verify_url: str, encrypted: bool
+) -> str:
     """The text of ``prosody.cfg.lua`` in ``folder``; see ``write`` for the other arguments.
 
     Raises:
@@ -91,6 +105,8 @@ def configuration(folder: Path, *, domain: str, host: str, port: int, verify_url
     if not encrypted and not ipaddress.ip_address(host).is_loopback:
         raise ConfigurationError(f"without a certificate Prosody must listen on loopback, not on {host}")
     modules = ["roster", "saslauth", "ping", "disco", "limits", *(["tls"] if encrypted else [])]
+    if websocket_port is not None:
+        modules.append("websocket")
     lines = [
         "-- Written by `python -m infra.prosody` at each start; do not edit.",
         f"data_path = {_lua(folder)}",
@@ -114,6 +130,7 @@ def configuration(folder: Path, *, domain: str, host: str, port: int, verify_url
         f"unlimited_jids = {{ {_lua(f'{jids.CLOUD}@{domain}')} }}",
         # Only applies where no other user exists.
         "run_as_root = true",
+        *([] if websocket_port is None else _websocket(folder, domain, host, websocket_port, encrypted=encrypted)),
         f"VirtualHost {_lua(domain)}",
         'authentication = "telescope"',
         f"telescope_verify_url = {_lua(verify_url)}",
@@ -121,6 +138,24 @@ def configuration(folder: Path, *, domain: str, host: str, port: int, verify_url
     if encrypted:
         lines.append(f"ssl = {{ certificate = {_lua(folder / _CERTIFICATE_FILE)}, key = {_lua(folder / _KEY_FILE)} }}")
     return "\n".join(lines) + "\n"
+
+
+def _websocket(folder: Path, domain: str, host: str, port: int, *, encrypted: bool) -> list[str]:
+    """Options for browsers. Only the WebSocket of RFC 7395 is served."""
+    used, unused = ("https", "http") if encrypted else ("http", "https")
+    lines = [
+        f"{used}_ports = {{ {port} }}",
+        f"{used}_interfaces = {{ {_lua(host)} }}",
+        f"{unused}_ports = {{}}",
+        "-- Browsers name the host of the URL, which need not be the domain.",
+        f"http_default_host = {_lua(domain)}",
+        "-- CORS does not apply to a WebSocket, which signs in with a password and never with a cookie.",
+        "http_cors_override = { websocket = { enabled = false } }",
+    ]
+    if encrypted:
+        files_in = {"certificate": folder / _CERTIFICATE_FILE, "key": folder / _KEY_FILE}
+        lines.append(f"https_ssl = {{ {', '.join(f'{name} = {_lua(path)}' for name, path in files_in.items())} }}")
+    return lines
 
 
 def _lua(value: object) -> str:

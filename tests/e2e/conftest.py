@@ -20,7 +20,7 @@ LABORATORY = {
     "test_steering",
 }
 """Test files that use the product with all devices of the laboratory."""
-OWN = {"test_fleet", "test_make_up", "test_sign_in", "test_tls", "test_xmpp"}
+OWN = {"test_fleet", "test_make_up", "test_sign_in", "test_tls", "test_xmpp", "test_xmpp_console"}
 """Test files that start their own product. All other files share a product with one arm."""
 
 

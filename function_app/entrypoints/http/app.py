@@ -123,7 +123,7 @@ def create_app(functions: Functions) -> FastAPI:
         _Headers,
         clock=functions.clock,
         metrics=functions.metrics,
-        websocket_url=functions.settings.websocket_url,
+        websocket_urls=(functions.settings.websocket_url, functions.settings.xmpp.websocket_url),
         secure=_requires_hsts(functions.settings.public_url),
     )
     if functions.tracing.enabled:
@@ -235,13 +235,16 @@ class _Addresses:
 class _Headers:
     """Adds headers to every response, and returns a 500 response for unhandled errors. Plain ASGI, for speed."""
 
-    def __init__(self, app: ASGIApp, *, clock: Clock, metrics: Metrics, websocket_url: str, secure: bool) -> None:
+    def __init__(
+        self, app: ASGIApp, *, clock: Clock, metrics: Metrics, websocket_urls: tuple[str, ...], secure: bool
+    ) -> None:
         self._app = app
         self._clock = clock
         self._metrics = metrics
+        servers = " ".join(url.partition("?")[0] for url in websocket_urls if url)
         policy = (
             "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; font-src 'self'; "
-            f"connect-src 'self' {websocket_url.split('?', maxsplit=1)[0]}; base-uri 'none'; form-action 'none'; "
+            f"connect-src 'self' {servers}; base-uri 'none'; form-action 'none'; "
             "frame-ancestors 'none'"
         )
         self._fixed = [

@@ -109,19 +109,8 @@ class MqttCredentials:
 
         Raises ``device-unknown``, ``forbidden``, ``streaming-unavailable``, ``lease-lost`` or ``broker-unavailable``.
         """
-        device = await self._devices.get(caller, device_id)
+        device, lease = await self.require_control(caller, device_id, epoch)
         now_ms = self._clock.now_ms()
-        async with self._control_events.recording_rejections(device, caller, "steer"):
-            require_operator(device)
-            if not device.streaming:
-                raise Problem(
-                    "streaming-unavailable",
-                    409,
-                    "The device accepts no setpoints",
-                    "The agent of this device polls over HTTP, so setpoints do not reach it. Use actions, or set the "
-                    "agent's transport to mqtt.",
-                )
-            lease = rules.require_held(await read_lease(self._tables, device), caller, epoch=epoch, now_ms=now_ms)
         # Longer than the lease, which may be renewed, but not longer than the permission.
         lifetime_s = min(max(CONTROL_MIN_S, lease.lease_ms // 1000), max(1, (device.until_ms - now_ms) // 1000))
         publish = (f"{device.topic}/{topics.CTL}/{epoch}",)
@@ -136,6 +125,26 @@ class MqttCredentials:
         issued = await self._issue(grant, lifetime_s, publish, ())
         await self._revoke_unless(issued, self._devices.require_still_allowed(caller, device))
         return issued
+
+    async def require_control(self, caller: Identity, device_id: str, epoch: int) -> tuple[Device, rules.Lease]:
+        """The device and the caller's lease, if the caller may send setpoints in this epoch.
+
+        Raises ``device-unknown``, ``forbidden``, ``streaming-unavailable`` or ``lease-lost``.
+        """
+        device = await self._devices.get(caller, device_id)
+        now_ms = self._clock.now_ms()
+        async with self._control_events.recording_rejections(device, caller, "steer"):
+            require_operator(device)
+            if not device.streaming:
+                raise Problem(
+                    "streaming-unavailable",
+                    409,
+                    "The device accepts no setpoints",
+                    "The agent of this device polls over HTTP, so setpoints do not reach it. Use actions, or set the "
+                    "agent's transport to mqtt.",
+                )
+            lease = rules.require_held(await read_lease(self._tables, device), caller, epoch=epoch, now_ms=now_ms)
+        return device, lease
 
     async def _revoke_unless(self, issued: IssuedCredentials, still: Awaitable[object]) -> None:
         """Revoke credentials whose permission ended while they were issued."""

@@ -20,7 +20,15 @@ from function_app.ports.clock import Clock
 from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import Tables
 from function_app.services.devices.device_access import DeviceAccess, require_claimed
-from function_app.services.identity.authenticator import ALGORITHM, SESSION_S, XMPP, Authenticator, decode
+from function_app.services.identity.authenticator import (
+    ACCESS_S,
+    ALGORITHM,
+    API,
+    SESSION_S,
+    XMPP,
+    Authenticator,
+    decode,
+)
 from function_app.services.identity.sign_in import SignIn
 from function_app.services.storage import records
 
@@ -62,7 +70,18 @@ class Admitted:
 
 
 class XmppCredentials:
-    """Creates and verifies passwords. ``domain``: domain part of every JID; empty: there is no XMPP server."""
+    """Creates and verifies passwords.
+
+    Args:
+        tables: Agents and accounts.
+        keys: Sign the passwords.
+        authenticator: Issues and verifies passwords of persons.
+        sign_in: Names of accounts.
+        devices: Agents of an account.
+        clock: Current time.
+        domain: Domain part of every JID; empty: there is no XMPP server.
+        browsers: Whether the server accepts connections of browsers.
+    """
 
     def __init__(
         self,
@@ -74,6 +93,7 @@ class XmppCredentials:
         devices: DeviceAccess,
         clock: Clock,
         domain: str,
+        browsers: bool,
     ) -> None:
         self._tables = tables
         self._keys = keys
@@ -82,6 +102,7 @@ class XmppCredentials:
         self._devices = devices
         self._clock = clock
         self._domain = domain
+        self._browsers = browsers
 
     async def agent(self, agent: Agent) -> Password:
         """Credentials of an agent.
@@ -104,6 +125,26 @@ class XmppCredentials:
         lifetime_s = caller.lifetime_s(SESSION_S, now_ms)
         token = await self._authenticator.issue(caller, XMPP, lifetime_s)
         return Password(caller.account, token, now_ms + lifetime_s * 1000, lifetime_s)
+
+    async def browser(self, caller: Identity) -> tuple[Password, str]:
+        """Credentials of a page that sends setpoints, and an access token for its sign-in at the gateway.
+
+        Both are short-lived, because the XMPP server sees them.
+
+        Raises:
+            Problem: ``xmpp-unavailable``.
+        """
+        self._require()
+        if not self._browsers:
+            detail = (
+                "The XMPP server accepts no browsers. Send setpoints over MQTT, or set TELESCOPE_XMPP_WEBSOCKET_URL."
+            )
+            raise Problem("xmpp-unavailable", 409, "No XMPP server for browsers", detail)
+        now_ms = self._clock.now_ms()
+        lifetime_s = caller.lifetime_s(ACCESS_S, now_ms)
+        password = await self._authenticator.issue(caller, XMPP, lifetime_s)
+        token = await self._authenticator.issue(caller, API, lifetime_s)
+        return Password(caller.account, password, now_ms + lifetime_s * 1000, lifetime_s), token
 
     async def cloud(self) -> Password:
         """Credentials of the XMPP gateway.

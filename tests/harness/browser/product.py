@@ -31,19 +31,19 @@ _COLUMNS = (("qpos", "joints"), ("qvel", "joints"), ("target", "actuators"), ("c
 
 
 def free_ports() -> int:
-    """First of four consecutive free ports."""
+    """First of five consecutive free ports."""
     for _ in range(100):
         with contextlib.ExitStack() as stack:
             first = stack.enter_context(socket.socket())
             first.bind(("127.0.0.1", 0))
             port: int = first.getsockname()[1]
             try:
-                for offset in (1, 2, 3):
+                for offset in (1, 2, 3, 4):
                     stack.enter_context(socket.socket()).bind(("127.0.0.1", port + offset))
             except (OSError, OverflowError):
                 continue
             return port
-    raise AssertionError("no four free ports in a row")
+    raise AssertionError("no five free ports in a row")
 
 
 @dataclass

@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -24,6 +24,7 @@ from device_agent.transports.xmpp import XmppAccess, XmppTransport
 from function_app.entrypoints.xmpp.program import create_gateway
 from function_app.ports.broker_access import Credentials
 from function_app.settings import Settings, Xmpp
+from infra.prosody.configuration import PATH
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person
 from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
@@ -48,11 +49,12 @@ def free_port() -> int:
 
 @dataclass
 class Prosody:
-    """A Prosody process."""
+    """A Prosody process. ``websocket_port``: for browsers."""
 
     process: "subprocess.Popen[str]"
     home: Path
     port: int
+    websocket_port: int
 
     def kill(self) -> None:
         """Kill Prosody and the program that runs it."""
@@ -71,10 +73,11 @@ class Prosody:
 @contextlib.contextmanager
 def start_prosody(home: Path, verify_url: str, *, port: int = 0, more: tuple[str, ...] = ()) -> Iterator[Prosody]:
     home.mkdir(parents=True, exist_ok=True)
+    where = ("--home", str(home), "--port", str(port), "--websocket-port", "0")
     named = ("--domain", DOMAIN, "--verify-url", verify_url, *more)
     with (home / "stderr").open("a") as stderr:
         process = subprocess.Popen(
-            [sys.executable, "-m", "infra.prosody", "--home", str(home), "--port", str(port), *named],
+            [sys.executable, "-m", "infra.prosody", *where, *named],
             cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=stderr,
@@ -85,7 +88,8 @@ def start_prosody(home: Path, verify_url: str, *, port: int = 0, more: tuple[str
                 assert process.stdout is not None
                 line = process.stdout.readline()
                 assert line.startswith("ready xmpp="), f"{line!r} {(home / 'stderr').read_text()}"
-                yield Prosody(process, home, int(line.partition("=")[2]))
+                ports = [int(each.partition("=")[2]) for each in line.split()[1:]]
+                yield Prosody(process, home, *ports)
             finally:
                 if process.poll() is None:
                     process.terminate()
@@ -190,7 +194,9 @@ def open_site(
         listener = stack.enter_context(socket.create_server((HOST, 0)))
         url = f"http://{HOST}:{listener.getsockname()[1]}"
         prosody = stack.enter_context(start_prosody(folder, f"{url}/api/v1/xmpp/verify"))
-        cloud = open_cloud(replace(settings, xmpp=Xmpp(domain=DOMAIN, host=HOST, port=prosody.port)))
+        websocket_url = f"ws://{HOST}:{prosody.websocket_port}{PATH}"
+        xmpp = Xmpp(domain=DOMAIN, host=HOST, port=prosody.port, websocket_url=websocket_url)
+        cloud = open_cloud(replace(settings, xmpp=xmpp))
         stack.enter_context(served(cloud, listener))
         site = XmppSite(cloud, prosody, url)
         if gateway:
@@ -279,10 +285,15 @@ class _Line:
 
 
 class XmppClient:
-    """A generic XMPP client; a context manager that disconnects."""
+    """A generic XMPP client; a context manager that disconnects.
+
+    Attributes:
+        on_message: Called with each message in the thread of the client; a test may replace it.
+    """
 
     def __init__(self, port: int, user: str, password: str, *, resource: str = "test") -> None:
         self.messages: list[Element] = []
+        self.on_message: Callable[[Element], None] = lambda _: None
         self.presences: list[Element] = []
         self.trouble: OSError | None = None
         self._login = Login(HOST, port, f"{user}@{DOMAIN}/{resource}", password)
@@ -292,7 +303,7 @@ class XmppClient:
         self.opened = self._run(self._open())
 
     async def _open(self) -> bool:
-        self.stream = Stream(self._login, message=self.messages.append, presence=self.presences.append)
+        self.stream = Stream(self._login, message=self._receive, presence=self.presences.append)
         try:
             await self.stream.open()
         except OSError as error:
@@ -300,6 +311,10 @@ class XmppClient:
             return False
         self._staying = asyncio.create_task(self.stream.stay())
         return True
+
+    def _receive(self, stanza: "Element") -> None:
+        self.messages.append(stanza)
+        self.on_message(stanza)
 
     @property
     def ended(self) -> bool:
@@ -333,10 +348,11 @@ class XmppClient:
 
 
 @contextlib.contextmanager
-def start_xmpp_processes(folder: Path) -> Iterator[CloudProcesses]:
-    """Cloud processes with Prosody and an XMPP gateway."""
+def start_xmpp_processes(folder: Path, more: Mapping[str, str] | None = None) -> Iterator[CloudProcesses]:
+    """Cloud processes with these additional settings, Prosody and an XMPP gateway."""
     port = free_port()
     settings = {"TELESCOPE_XMPP_DOMAIN": DOMAIN, "TELESCOPE_XMPP_HOST": HOST, "TELESCOPE_XMPP_PORT": str(port)}
+    settings |= more or {}
     with start_cloud_processes("mosquitto", folder, settings) as processes:
         end = ProsodyEndpoint(folder / "prosody", f"{processes.url}/api/v1/xmpp/verify", port, processes.stack)
         processes.endpoints["xmpp"] = end

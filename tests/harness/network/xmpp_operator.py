@@ -2,28 +2,38 @@
 
 import itertools
 import json
-from typing import Any
+from typing import Any, Protocol
+
+import httpx
 
 from device_agent.protocol.xmpp import jids, operator_stanzas, stanzas
 from device_agent.protocol.xmpp.operator_stanzas import Answer
-from tests.harness.cloud.cloud import Person
 from tests.harness.network.brokers import wait_until
-from tests.harness.network.xmpp import XmppClient, XmppSite
+from tests.harness.network.xmpp import XmppClient
+
+
+class Account(Protocol):
+    """A signed-in account."""
+
+    account: str
+    token: str
+
+    def post(self, path: str, body: Any) -> httpx.Response: ...
 
 
 class XmppOperator(XmppClient):
     """A signed-in operator.
 
     Args:
-        site: The site.
+        port: Port of the XMPP server.
         person: The account.
         token: Access token; default: the person's.
         resource: Resource of the JID.
     """
 
-    def __init__(self, site: XmppSite, person: Person, *, token: str = "", resource: str = "operator") -> None:
+    def __init__(self, port: int, person: Account, *, token: str = "", resource: str = "operator") -> None:
         issued = person.post("/xmpp/credentials", {"purpose": "view"}).json()
-        super().__init__(site.prosody.port, person.account, issued["password"], resource=resource)
+        super().__init__(port, person.account, issued["password"], resource=resource)
         assert self.opened, self.trouble
         self._numbers = itertools.count(1)
         self._token = token or person.token

@@ -21,7 +21,7 @@ TELEMETRY = b'{"sequence":1,"at_ms":1,"tick_ms":1,"position_rad":[0.1],"commande
 
 @pytest.fixture
 def operator(site: XmppSite, anna: Person) -> Iterator[XmppOperator]:
-    with XmppOperator(site, anna) as operator:
+    with XmppOperator(site.prosody.port, anna) as operator:
         assert operator.sign_in().status == 204
         yield operator
 
@@ -91,7 +91,7 @@ def test_a_viewer_cannot_act_and_a_stranger_sees_nothing(site: XmppSite, robot: 
     victor, bert = site.cloud.sign_in("victor"), site.cloud.sign_in("bert")
     share = {"account": victor.name, "role": "viewer"}
     assert anna.post(f"/spaces/{robot.space}/shares", share).status_code == 201
-    with XmppOperator(site, victor) as viewer, XmppOperator(site, bert) as stranger:
+    with XmppOperator(site.prosody.port, victor) as viewer, XmppOperator(site.prosody.port, bert) as stranger:
         for person, expected in ((viewer, 403), (stranger, 404)):
             assert person.sign_in().status == 204
             status, problem = person.call("POST", f"/devices/{robot.device}/lease", {"lease_ms": 5000})
@@ -103,15 +103,15 @@ def test_a_viewer_cannot_act_and_a_stranger_sees_nothing(site: XmppSite, robot: 
 
 
 def test_calls_need_a_sign_in_with_a_token_of_the_same_account(site: XmppSite, robot: XmppRobot, anna: Person) -> None:
-    with XmppOperator(site, anna, token=site.cloud.sign_in("bert").token) as foreign:
+    with XmppOperator(site.prosody.port, anna, token=site.cloud.sign_in("bert").token) as foreign:
         assert foreign.call("GET", "/devices")[0] == 401
         assert foreign.sign_in().status == 403
         assert foreign.call("GET", "/devices")[0] == 401
         foreign.publish(f"{robot.topic(topics.CTL)}/1", b"{}")
-    with XmppOperator(site, anna, token="wrong") as wrong:
+    with XmppOperator(site.prosody.port, anna, token="wrong") as wrong:
         assert wrong.sign_in().status == 401
     carl = site.cloud.sign_in("carl")
-    with XmppOperator(site, carl) as operator:
+    with XmppOperator(site.prosody.port, carl) as operator:
         assert operator.sign_in().status == 204
         assert carl.post("/auth/sign-out").status_code == 204
         wait_until(lambda: operator.call("GET", "/devices")[0] == 401, "the end of the session")
@@ -144,7 +144,7 @@ def test_a_malformed_stanza_is_rejected(operator: XmppOperator, content: str) ->
 
 def test_a_disconnected_operator_leaves_no_broker_connection(site: XmppSite, anna: Person) -> None:
     gateway = site.gateways[0].gateway
-    with XmppOperator(site, anna) as operator:
+    with XmppOperator(site.prosody.port, anna) as operator:
         assert operator.sign_in().status == 204
         assert len(gateway._operators._sessions) == 1
     wait_until(lambda: not gateway._operators._sessions, "the end of the session")
@@ -157,11 +157,14 @@ def test_the_number_of_sessions_is_limited_for_an_account_and_in_total(
     wait_until(lambda: not sessions, "the end of earlier sessions")
     monkeypatch.setattr(operators, "MAX_OF_ACCOUNT", 1)
     monkeypatch.setattr(operators, "MAX_SESSIONS", 1)
-    with XmppOperator(site, anna, resource="first") as first, XmppOperator(site, anna, resource="second") as second:
+    with (
+        XmppOperator(site.prosody.port, anna, resource="first") as first,
+        XmppOperator(site.prosody.port, anna, resource="second") as second,
+    ):
         assert first.sign_in().status == 204
         assert second.sign_in().status == 204
         assert first.call("GET", "/devices")[0] == 401
-        with XmppOperator(site, site.cloud.sign_in("bert")) as other:
+        with XmppOperator(site.prosody.port, site.cloud.sign_in("bert")) as other:
             assert other.sign_in().status == 503
         assert second.call("GET", "/devices")[0] == 200
 

@@ -10,6 +10,7 @@ from benchmarks.peers import operators
 from benchmarks.peers.arm import HOME_RAD, NAMES, setpoint
 from benchmarks.peers.robots import from_ros, to_ros
 from benchmarks.reporting.report import Report
+from benchmarks.suites import operator
 from device_agent.protocol import JointTarget, JointTelemetry, Mode, Setpoint, codec
 
 
@@ -28,6 +29,28 @@ def test_table_2_compares_with_the_fastest_transport_other_than_mqtt(ours_ms: fl
     claim = table2.claim(Condition(15, 0.0, 1), samples)
     assert (claim.measured, claim.holds) == (ours_ms / 3.0, holds)
     assert "WebSocket" in claim.text
+
+
+@pytest.mark.parametrize(("ours_ms", "holds"), [(824.0, True), (830.0, False)])
+def test_table_2_from_operator_to_robot_compares_with_the_published_mean(
+    report: Report, ours_ms: float, holds: bool
+) -> None:
+    operator.show(report, [1.0] * table2.SAMPLES, [ours_ms] * table2.SAMPLES)
+    assert report.tables[0].rows[0] == [1, 800, 1.0, ours_ms]
+    assert report.tables[0].rows[-1] == ["average", 824.25, 1.0, ours_ms]
+    (claim,) = report.claims
+    assert (claim.measured, claim.bound, claim.holds) == (ours_ms, 824.25, holds)
+
+
+def test_paths_from_operator_to_robot_are_compared_with_mqtt_in_the_same_direction() -> None:
+    found = {operator.BOTH_XMPP: ([4.0], [12.0]), operator.MQTT: ([2.0], [3.0])}
+    table = operator.all_samples(0, found)
+    assert [(row[0], row[-1]) for row in table.rows] == [
+        (f"{operator.BOTH_XMPP}, to the robot", 2.0),
+        (f"{operator.BOTH_XMPP}, and back", 4.0),
+        (f"{operator.MQTT}, to the robot", 1.0),
+        (f"{operator.MQTT}, and back", 1.0),
+    ]
 
 
 @pytest.mark.parametrize("quick", [True, False])

@@ -95,6 +95,10 @@ def test_settings_and_their_defaults(environment: dict[str, str], expected: dict
         ),
         (("TELESCOPE_WEBSOCKET_URL",), ["", "http://x", "ws://", "ws://a;script-src *", "ws://a b", "wss://x:99999"]),
         (("TELESCOPE_XMPP_DOMAIN",), ["Lab", "a b", "lab.", "-lab", "lab/x", "a@b", "lab\n", "x" * 254]),
+        (
+            ("TELESCOPE_XMPP_WEBSOCKET_URL",),
+            ["https://x", "wss://", "wss://u:p@x/ws", "wss://x/ws?token=1", "wss://x/#a", "wss://x; script-src *"],
+        ),
         (("TELESCOPE_HOST", "TELESCOPE_MQTT_HOST", "TELESCOPE_XMPP_HOST"), ["", "a b"]),
         (("TELESCOPE_HOME",), ["", "~no-such-user/x"]),
         (("TELESCOPE_ROBOTS", "TELESCOPE_CONSOLE"), [""]),
@@ -105,6 +109,15 @@ def test_an_invalid_variable_is_named_in_one_line(names: tuple[str, ...], values
     for name in names:
         for value in values:
             assert_invalid(name, value, name)
+
+
+def test_browsers_reach_an_xmpp_server_only_with_its_domain() -> None:
+    url = {"TELESCOPE_XMPP_WEBSOCKET_URL": "wss://xmpp.lab.example/xmpp-websocket"}
+    with pytest.raises(SettingsError, match="set TELESCOPE_XMPP_DOMAIN too"):
+        settings.read(url)
+    known = settings.read(url | {"TELESCOPE_XMPP_DOMAIN": "lab.example"})
+    assert known.xmpp.websocket_url == "wss://xmpp.lab.example/xmpp-websocket"
+    assert settings.read({"TELESCOPE_XMPP_DOMAIN": "lab.example"}).xmpp.websocket_url == ""
 
 
 def test_the_port_leaves_room_for_the_two_that_follow() -> None:

@@ -11,6 +11,8 @@ def test_xmpp_is_optional() -> None:
     environment = settings.read({"TELESCOPE_XMPP": "1", "TELESCOPE_PORT": "9000"}).environment()
     assert environment["TELESCOPE_XMPP_DOMAIN"] == settings.XMPP_DOMAIN
     assert environment["TELESCOPE_XMPP_PORT"] == "9003"
+    assert environment["TELESCOPE_XMPP_WEBSOCKET_URL"] == "ws://127.0.0.1:9004/xmpp-websocket"
+    assert settings.read({}).environment()["TELESCOPE_XMPP_WEBSOCKET_URL"] == ""
 
 
 def test_the_default_room_is_the_laboratory() -> None:

@@ -18,6 +18,7 @@ def text(tmp_path: Path, **changes: Any) -> str:
         "domain": "lab.example",
         "host": "127.0.0.1",
         "port": 5222,
+        "websocket_port": None,
         "verify_url": "http://127.0.0.1:8080/api/v1/xmpp/verify",
         "certificate": None,
         "key": None,
@@ -35,6 +36,26 @@ def test_encryption_is_required_except_on_loopback(tmp_path: Path) -> None:
     assert "c2s_require_encryption = true" in secure
     assert "allow_unencrypted_plain_auth = false" in secure
     assert '"tls"' in secure
+
+
+def test_browsers_are_served_only_on_request_and_with_the_encryption_of_the_others(tmp_path: Path) -> None:
+    without = text(tmp_path)
+    assert "websocket" not in without
+    assert "http" not in without.replace("http://127.0.0.1:8080", "").replace("https://prosody", "")
+    plain = text(tmp_path, websocket_port=5280)
+    assert '"websocket"' in plain
+    assert "http_ports = { 5280 }\n" in plain
+    assert "https_ports = {}\n" in plain
+    assert 'http_interfaces = { "127.0.0.1" }\n' in plain
+    assert "http_cors_override = { websocket = { enabled = false } }\n" in plain
+    for name in ("c.pem", "k.pem"):
+        (tmp_path / name).touch()
+    files = {"certificate": tmp_path / "c.pem", "key": tmp_path / "k.pem"}
+    secure = text(tmp_path, host="192.168.1.5", websocket_port=5281, **files)
+    assert "https_ports = { 5281 }\n" in secure
+    assert "http_ports = {}\n" in secure
+    assert 'https_interfaces = { "192.168.1.5" }\n' in secure
+    assert f'https_ssl = {{ certificate = "{tmp_path}/domain.crt", key = "{tmp_path}/domain.key" }}\n' in secure
 
 
 @pytest.mark.parametrize("changes", [{"host": "0.0.0.0"}, {"host": "192.168.1.5"}, {"key": Path("k.pem")}])  # noqa: S104 (rejected)

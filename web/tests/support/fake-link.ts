@@ -1,9 +1,10 @@
 /** A broker connection in memory: the test delivers messages and reads what was published. */
 import { computed, signal } from "@preact/signals-core";
-import type { Link, LinkState, LinkStatus, Receiver } from "../../src/shared/mqtt/mqtt-link";
+import type { Link, LinkState, LinkStatus, Receiver, SetpointTransport } from "../../src/shared/mqtt/mqtt-link";
 import { matches } from "../../src/shared/mqtt/topics";
 
 export class FakeLink implements Link {
+  transport: SetpointTransport = "mqtt";
   readonly #receivers = new Set<[filter: string, receiver: Receiver]>();
   readonly status = signal<LinkStatus>({ state: "up", reason: "" });
   readonly up = computed(() => this.status.value.state === "up");

@@ -15,7 +15,8 @@ export const bytes = (value: unknown): Uint8Array => new TextEncoder().encode(ty
 export function listed(part: Partial<Device> = {}): Device {
   return {
     id: DEVICE, name: "arm", label: "Arm", kind: "arm", robot_type: "ur5", agent: "a1", space: "lab", role: "owner",
-    owner: { id: "account0001", name: "Ann" }, topic: TOPIC, online: true, incompatible: null, last_seen_at: null, lease: null, ...part,
+    owner: { id: "account0001", name: "Ann" }, topic: TOPIC, online: true, incompatible: null, last_seen_at: null, lease: null,
+    setpoints_over: ["mqtt"], ...part,
   };
 }
 

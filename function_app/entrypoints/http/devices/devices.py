@@ -25,14 +25,14 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         """Returns devices with presence, newest state and lease. A page has the devices of up to ``limit`` agents."""
         caller = await auth.account(request)
         views, next_cursor = await functions.devices.views(caller, cursor=cursor, limit=limit)
-        items = tuple(device_out(view, caller, functions.clock.now_ms()) for view in views)
+        items = tuple(device_out(functions, view, caller) for view in views)
         return json_response(schemas.DeviceList(items=items, cursor=next_cursor))
 
     @routes.add("GET /devices/{device}", "Get a device", schemas.DeviceOut, 404)
     async def get_device(request: Request, device: str) -> Response:
         """Returns the device with presence, newest state and lease."""
         caller = await auth.account(request)
-        return json_response(device_out(await functions.devices.view(caller, device), caller, functions.clock.now_ms()))
+        return json_response(device_out(functions, await functions.devices.view(caller, device), caller))
 
     _label_and_viewer_routes(routes, functions, auth)
     return routes
@@ -55,7 +55,7 @@ def _label_and_viewer_routes(routes: Routes, functions: Functions, auth: Request
         if error:
             raise invalid(f"The label {error}.")
         await functions.rename.rename(caller, device, label)
-        return json_response(device_out(await functions.devices.view(caller, device), caller, functions.clock.now_ms()))
+        return json_response(device_out(functions, await functions.devices.view(caller, device), caller))
 
     @routes.add("PUT /devices/{device}/viewers", "Register as a viewer and list other viewers", schemas.ViewersOut, 404)
     async def add_viewer(request: Request, device: str) -> Response:

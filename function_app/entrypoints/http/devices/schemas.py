@@ -16,7 +16,8 @@ class DeviceOut(Response, frozen=True, kw_only=True):
     """A device. ``role``: the caller's role. ``state``: the newest ``state`` message of the device.
 
     ``incompatible``: why the agent and this server cannot work together, and which of them to update.
-    ``streaming``: setpoints reach the device; otherwise only actions move it.
+    ``streaming``: setpoints reach the device; otherwise only actions move it. ``setpoints_over``: the transports by
+    which a browser can send setpoints.
     """
 
     id: str
@@ -30,6 +31,7 @@ class DeviceOut(Response, frozen=True, kw_only=True):
     owner: AccountRef
     topic: str
     streaming: bool
+    setpoints_over: tuple[Literal["mqtt", "xmpp"], ...]
     online: bool
     incompatible: str | None
     last_seen_at: Moment | None

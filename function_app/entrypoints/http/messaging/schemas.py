@@ -4,7 +4,11 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Raw
 
-from function_app.entrypoints.http.control.schemas import AgentCredentialsRequest, ViewCredentialsRequest
+from function_app.entrypoints.http.control.schemas import (
+    AgentCredentialsRequest,
+    ControlCredentialsRequest,
+    ViewCredentialsRequest,
+)
 from function_app.entrypoints.http.framework.schemas import AgentRequest, Moment, Request, Response
 
 
@@ -49,13 +53,15 @@ class MessageResults(Response, frozen=True, kw_only=True):
     results: tuple[MessageResult, ...]
 
 
-XmppCredentialsRequest = ViewCredentialsRequest | AgentCredentialsRequest
+XmppCredentialsRequest = ViewCredentialsRequest | ControlCredentialsRequest | AgentCredentialsRequest
 
 
 class XmppCredentialsOut(Response, frozen=True, kw_only=True):
     """XMPP credentials and server address.
 
     ``cloud``: bare JID of the XMPP gateway. For an agent also the statements that rotate the server's signing keys.
+    For control also ``token``, an access token that signs in at the gateway and expires with the password, and
+    ``websocket_url``, the server's address for browsers.
     """
 
     jid: str
@@ -67,6 +73,8 @@ class XmppCredentialsOut(Response, frozen=True, kw_only=True):
     host: str
     port: int
     server_time_ms: int
+    token: str = ""
+    websocket_url: str = ""
     key_statements: tuple[str, ...] = ()
     signing_key: str = ""
 

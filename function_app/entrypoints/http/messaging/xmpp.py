@@ -8,7 +8,7 @@ from fastapi import Request, Response
 from device_agent.protocol.xmpp import jids
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
-from function_app.entrypoints.http.control.schemas import AgentCredentialsRequest
+from function_app.entrypoints.http.control.schemas import AgentCredentialsRequest, ControlCredentialsRequest
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
 from function_app.entrypoints.http.framework.responses import json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
@@ -25,18 +25,24 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         "POST /xmpp/credentials",
         "Get XMPP credentials",
         schemas.XmppCredentialsOut,
-        409,
+        (404, 409),
         body=schemas.XmppCredentialsRequest,
         caller="account or agent",
     )
     async def xmpp_credentials(request: Request) -> Response:
-        """Returns credentials for an agent with transport ``xmpp``, or for an XMPP client that views agents."""
+        """Returns credentials for an agent with transport ``xmpp``, an XMPP client, or setpoints under a lease."""
         payload: Any = await read(request, schemas.XmppCredentialsRequest)
         space: str | None = None
+        token = websocket_url = ""
         if isinstance(payload, AgentCredentialsRequest):
             agent = await auth.agent(request)
             issued = await functions.xmpp_credentials.agent(agent)
             space = agent.space
+        elif isinstance(payload, ControlCredentialsRequest):
+            caller = await auth.account(request)
+            await functions.mqtt_credentials.require_control(caller, payload.device, payload.epoch)
+            issued, token = await functions.xmpp_credentials.browser(caller)
+            websocket_url = functions.settings.xmpp.websocket_url
         else:
             issued = await functions.xmpp_credentials.account(await auth.account(request))
         settings = functions.settings
@@ -51,6 +57,8 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             host=settings.xmpp.host,
             port=settings.xmpp.port,
             server_time_ms=functions.clock.now_ms(),
+            token=token,
+            websocket_url=websocket_url,
             key_statements=() if keys is None else keys.statements,
             signing_key="" if keys is None else keys.signing,
         )

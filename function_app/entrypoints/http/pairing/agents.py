@@ -113,7 +113,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             caller, payload.code, payload.space, address=client_address(request, functions.settings.trusted_proxies)
         )
         views = await functions.devices.of_agent(caller, agent.id)
-        devices = tuple(device_out(view, caller, functions.clock.now_ms()) for view in views)
+        devices = tuple(device_out(functions, view, caller) for view in views)
         return json_response(schemas.ClaimOut(agent=agent.id, space=agent.space or "", devices=devices))
 
     @routes.add("GET /agents", "List agents", schemas.AgentList, 422)

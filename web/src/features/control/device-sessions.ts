@@ -3,7 +3,10 @@ import type { Account } from "../../shared/api/types";
 import { useEffect, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import type { DeviceStore, Fleet } from "../devices/model";
+import { storage } from "../../shared/hooks/browser-storage";
+import { storedTransport } from "../../shared/lib/local-storage";
 import { DeviceSession } from "./model/device-session";
+import { SetpointPreference } from "./model/setpoint-preference";
 
 /** One session per device, in order; none before the page is mounted. One key stops all of them. */
 export function useDeviceSessions(
@@ -18,7 +21,8 @@ export function useDeviceSessions(
   useEffect(() => {
     // Without a device, do not handle the Stop key.
     if (devices.length === 0) return undefined;
-    const created = devices.map((device) => new DeviceSession(api, fleet.link, device, account.id));
+    const preferred = new SetpointPreference(storedTransport(storage()));
+    const created = devices.map((device) => new DeviceSession(api, fleet.link, device, account.id, preferred));
     setSessions(created);
     const reportVisibility = (): void => {
       for (const { watchers: watching } of created) watching.setVisible(document.visibilityState === "visible");

@@ -17,7 +17,7 @@ export function CommandTraceCard({ session }: { session: DeviceSession }) {
   const lines = session.commandTrace.lines.value;
   return (
     <Card title={texts.trace.latency} class="latency">
-      <LiveLatency device={session.device} control={session.control} />
+      <LiveLatency session={session} />
       <h3>{texts.trace.title}</h3>
       {lines.length === 0 ? (
         <p class="quiet">{texts.trace.none}</p>

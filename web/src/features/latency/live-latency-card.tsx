@@ -1,14 +1,10 @@
-import type { Control } from "../control/model";
-import type { DeviceStore } from "../devices/model";
+import type { DeviceSession } from "../control/model";
+import { Choice } from "../../shared/ui/choice";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 
-interface LatencyProps {
-  device: DeviceStore;
-  control: Control;
-}
-
-export function LiveLatency({ device, control }: LatencyProps) {
+export function LiveLatency({ session }: { session: DeviceSession }) {
+  const { device, control } = session;
   const figures = control.roundTrip.figures.value;
   const telemetry = device.telemetry.value;
   const age = device.telemetryAgeMs.value;
@@ -52,8 +48,33 @@ export function LiveLatency({ device, control }: LatencyProps) {
           name={texts.live.watchdog}
           value={watchdog === undefined || watchdog === 0 ? format.unknown : ms(watchdog)}
         />
+        <Figure name={texts.live.setpoints} value={setpointText(session)} data-testid="setpoint-transport" />
       </dl>
+      {device.info.value.setpoints_over.length > 1 && <TransportChoice session={session} />}
     </>
+  );
+}
+
+/** The transport of the setpoints and the state of its connection. */
+function setpointText({ control }: DeviceSession): string {
+  const transport = control.transport.value;
+  if (transport === null) return format.unknown;
+  return `${texts.live.transport[transport]}, ${texts.live.connection[control.linkStatus.value?.state ?? "closed"]}`;
+}
+
+/** The choice applies to the next lease, so that a motion never changes its transport. */
+function TransportChoice({ session: { control, setpointPreference } }: { session: DeviceSession }) {
+  const names = texts.live.transport;
+  return (
+    <div data-testid="transport-choice">
+      <Choice
+        label={texts.live.setpoints}
+        value={setpointPreference.transport.value}
+        options={[["mqtt", names.mqtt], ["xmpp", names.xmpp]]}
+        onChange={(transport) => setpointPreference.choose(transport)}
+      />
+      {control.transport.value !== null && <p class="quiet small">{texts.live.nextControl}</p>}
+    </div>
   );
 }
 

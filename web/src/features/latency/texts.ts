@@ -16,6 +16,10 @@ export const texts = {
     loopExplained: "Age of the telemetry that the robot's last setpoint referred to.",
     telemetryAge: "Telemetry age",
     watchdog: "Watchdog",
+    setpoints: "Setpoints over",
+    transport: { mqtt: "MQTT", xmpp: "XMPP" },
+    connection: { connecting: "connecting", up: "connected", down: "not connected", refused: "rejected", closed: "closed" },
+    nextControl: "A change applies when you take control again.",
     samples: (count: number): string => `${count} samples`,
   },
 

@@ -12,8 +12,10 @@ export function blockedReason(device: DeviceStore, control: Control): string | n
   if (device.stopped.value) return texts.joints.stopped;
   if (!device.live.value) return texts.joints.waiting;
   if (mode === "action") return texts.joints.busy;
-  if (control.linkStatus.value?.state !== "up") return texts.steer.noConnection;
-  return null;
+  const link = control.linkStatus.value;
+  if (link?.state === "up") return null;
+  if (link !== null && link.reason !== "") return texts.steer.lostConnection(link.reason);
+  return texts.steer.noConnection;
 }
 
 interface BlockedNoticeProps {

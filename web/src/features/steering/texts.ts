@@ -105,6 +105,7 @@ export const texts = {
       unknown: (id: string): string => `This gamepad's layout is not supported, so it is ignored: ${id}.`,
     },
     noConnection: "Connecting for setpoints…",
+    lostConnection: (reason: string): string => `No connection for setpoints: ${reason}`,
     noStreaming:
       "Manual control is not available: this robot's agent polls over HTTP and cannot receive setpoints. Use actions and movements, or connect the agent over MQTT.",
   },

@@ -1,5 +1,5 @@
 /** The HTTP API calls of the console. The session uses an HttpOnly cookie. */
-import type { Account, Action, ActionCallOptions, ControlRequestInfo, Credentials, Device, GrantedLease, LatencyBatch, Lease, Purpose, ResetConfirmation, Series, SignInMethods, Space, StorageUsage, Upload, Watcher } from "./types";
+import type { Account, Action, ActionCallOptions, ControlPurpose, ControlRequestInfo, Credentials, Device, GrantedLease, LatencyBatch, Lease, Purpose, ResetConfirmation, Series, SignInMethods, Space, StorageUsage, Upload, Watcher, XmppCredentials } from "./types";
 import { AccountApi } from "./account";
 import { HealthApi } from "./health";
 import { LatencyApi } from "./latency";
@@ -282,6 +282,10 @@ export class Api {
 
   credentials(purpose: Purpose): Promise<Credentials> {
     return this.#http.call("POST", "/mqtt/credentials", { body: purpose });
+  }
+
+  xmppCredentials(purpose: ControlPurpose): Promise<XmppCredentials> {
+    return this.#http.call("POST", "/xmpp/credentials", { body: purpose });
   }
 
   #signedIn(response: SignedIn): string {

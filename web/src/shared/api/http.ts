@@ -125,6 +125,11 @@ function problem(status: number, body: unknown, request: string | null): ApiErro
   return new ApiError(status, type.split("/").pop() ?? "", message + reference, fields);
 }
 
+/** Whether the server rejects a request for credentials, so that repeating it is of no use. */
+export function isRefusal(error: unknown): boolean {
+  return error instanceof ApiError && [401, 403, 404, 409].includes(error.status);
+}
+
 /** An error as a sentence for display. */
 export function sentence(error: unknown): string {
   return error instanceof Error ? error.message : String(error);

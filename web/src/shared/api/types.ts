@@ -85,6 +85,8 @@ export interface Device {
   incompatible: string | null;
   last_seen_at: string | null;
   lease: Lease | null;
+  /** Transports by which a page can send setpoints. */
+  setpoints_over: ("mqtt" | "xmpp")[];
 }
 
 export interface GrantedLease {
@@ -156,7 +158,24 @@ export interface Credentials {
   websocket_url: string;
 }
 
-export type Purpose = { purpose: "view" } | { purpose: "control"; device: string; epoch: number };
+/** For setpoints over XMPP. The token signs in at the gateway and expires with the password. */
+export interface XmppCredentials {
+  jid: string;
+  password: string;
+  token: string;
+  lifetime_s: number;
+  /** Bare JID of the gateways. */
+  cloud: string;
+  websocket_url: string;
+}
+
+export interface ControlPurpose {
+  purpose: "control";
+  device: string;
+  epoch: number;
+}
+
+export type Purpose = { purpose: "view" } | ControlPurpose;
 
 export interface Space {
   id: string;

@@ -65,6 +65,11 @@ export function storedParameters(
   return new StoredValue(store, `parameters.${account}.${robotType}.${name}`, isRecord);
 }
 
+/** What carries setpoints; for all accounts of this browser. */
+export function storedTransport(store: Store | null): StoredValue<"mqtt" | "xmpp"> {
+  return new StoredValue(store, "setpoints", (value) => value === "mqtt" || value === "xmpp");
+}
+
 function isRecord(value: unknown): value is Record<string, unknown> {
   return typeof value === "object" && value !== null && !Array.isArray(value);
 }

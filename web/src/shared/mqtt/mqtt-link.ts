@@ -5,8 +5,9 @@
 import type { Credentials } from "../api/types";
 import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
 import type { MqttClient } from "mqtt";
-import { ApiError, sentence } from "../api/http";
+import { isRefusal, sentence } from "../api/http";
 import { now } from "../lib/clock";
+import { refreshDelayMs, retryDelayMs } from "../lib/reconnect";
 import { matches } from "./topics";
 
 export type LinkState = "connecting" | "up" | "down" | "refused" | "closed";
@@ -20,19 +21,27 @@ export interface LinkStatus {
 /** `retained`: the message was published before this page subscribed. */
 export type Receiver = (topic: string, payload: Uint8Array, retained: boolean) => void;
 
-/** The connection interface that the models use. */
-export interface Link {
+/** What carries setpoints. */
+export type SetpointTransport = "mqtt" | "xmpp";
+
+/** The connection for setpoints. */
+export interface SetpointLink {
+  readonly transport: SetpointTransport;
   readonly status: ReadonlySignal<LinkStatus>;
+  /** Publishes now or fails; messages are never queued. Resolves when sent (QoS 0) or acknowledged (QoS 1). */
+  publish(topic: string, message: object, qos: 0 | 1): Promise<void>;
+  close(): void;
+}
+
+/** The connection interface that the models use. */
+export interface Link extends SetpointLink {
   readonly up: ReadonlySignal<boolean>;
   /** Subscribes to a topic or filter; returns a function that unsubscribes. */
   subscribe(filter: string, receiver: Receiver): () => void;
-  /** Publishes now or fails; messages are never queued. Resolves when sent (QoS 0) or acknowledged (QoS 1). */
-  publish(topic: string, message: object, qos: 0 | 1): Promise<void>;
   /** Pings the broker; resolves with its response. */
   ping(): Promise<void>;
   /** Reconnects with new credentials, which include newly visible devices. */
   renew(): void;
-  close(): void;
 }
 
 /** Maximum filters per SUBSCRIBE at Event Grid and AWS IoT Core. */
@@ -42,8 +51,6 @@ const PING_AFTER_SILENCE_MS = 5_000;
 const DEAD_AFTER_SILENCE_MS = 12_000;
 const CONNECT_TIMEOUT_MS = 8_000;
 const NO_CONNECTION = "There is no connection to the broker.";
-const BACKOFF_MS = [250, 500, 1_000, 2_000, 4_000] as const;
-const REFRESH_MARGIN_MS = 60_000;
 
 interface Connection {
   client: MqttClient;
@@ -71,6 +78,7 @@ export class MqttLink implements Link {
   readonly #pendingFilters = new Set<string>();
   readonly #closing = new AbortController();
 
+  readonly transport = "mqtt";
   readonly status: ReadonlySignal<LinkStatus> = this.#status;
   readonly up = computed(() => this.#status.value.state === "up");
 
@@ -207,11 +215,8 @@ export class MqttLink implements Link {
     if (!client.connected) throw new Error("The broker closed the connection.");
     this.#attempts = 0;
     this.#status.value = { state: "up", reason: "" };
-    const lifetimeMs = credentials.lifetime_s * 1000;
-    const spentMs = now() - next.obtainedAt;
-    const refreshMs = Math.max(lifetimeMs - Math.min(REFRESH_MARGIN_MS, lifetimeMs / 3) - spentMs, 1_000);
     clearTimeout(this.#timer);
-    this.#timer = setTimeout(() => void this.#open(), refreshMs);
+    this.#timer = setTimeout(() => void this.#open(), refreshDelayMs(credentials.lifetime_s, now() - next.obtainedAt));
   }
 
   #lost(connection: Connection): void {
@@ -223,8 +228,7 @@ export class MqttLink implements Link {
 
   #failed(error: unknown): void {
     if (this.#closed) return;
-    const refused = error instanceof ApiError && [401, 403, 404, 409].includes(error.status);
-    if (refused) {
+    if (isRefusal(error)) {
       this.#drop();
       this.#status.value = { state: "refused", reason: sentence(error) };
       return;
@@ -237,10 +241,9 @@ export class MqttLink implements Link {
   }
 
   #retry(): void {
-    const step = BACKOFF_MS[Math.min(this.#attempts, BACKOFF_MS.length - 1)] ?? 4_000;
-    this.#attempts += 1;
     clearTimeout(this.#timer);
-    this.#timer = setTimeout(() => void this.#open(), step * (0.75 + Math.random() / 2));
+    this.#timer = setTimeout(() => void this.#open(), retryDelayMs(this.#attempts));
+    this.#attempts += 1;
   }
 
   #drop(): void {

@@ -3,14 +3,19 @@ import type { ControlRequestInfo, GrantedLease, Watcher } from "../../../src/sha
 import { Control, LEASE_MS } from "../../../src/features/control/model/lease";
 import type { ControlRequestState } from "../../../src/features/control/model/control-request";
 import { Watchers } from "../../../src/features/control/model/watchers";
+import { SetpointPreference } from "../../../src/features/control/model/setpoint-preference";
+import { DeviceStore } from "../../../src/features/devices/model/device-store";
+import { storedTransport } from "../../../src/shared/lib/local-storage";
+import type { SetpointTransport } from "../../../src/shared/mqtt/mqtt-link";
+import { FakeStorage } from "../../support/fake-storage";
 import { blockedReason } from "../../../src/features/steering/blocked-notice";
 import { texts } from "../../../src/features/steering/texts";
-import { deliver, device, ends, pass, server } from "../../support/console";
+import { deliver, device, ends, link, pass, server } from "../../support/console";
 import { FakeLink } from "../../support/fake-link";
 import { sealed } from "../../../src/shared/mqtt/sealed-setpoint";
 import type { Tagged } from "../../../src/shared/mqtt/protocol.generated";
 import { list, none, ok, problem, unreachable, type Answer } from "../../support/fake-server";
-import { DEVICE, TOPIC, description, state, telemetry } from "../../support/messages";
+import { DEVICE, TOPIC, description, listed, state, telemetry } from "../../support/messages";
 
 const LEASE = `/devices/${DEVICE}/lease`;
 const REQUEST = `${LEASE}/requests/r1`;
@@ -64,6 +69,48 @@ describe("control of a device", () => {
     deliver("desc", { ...description, streaming: false });
     expect(blockedReason(device, polled)).toBe(texts.steer.noStreaming);
     expect(opened).toBe(0);
+  });
+
+  it("uses the preferred transport if the site offers it, and never changes it during a lease", async () => {
+    const opened: string[] = [];
+    let preferred: SetpointTransport = "xmpp";
+    const open = (_device: string, epoch: number, transport: SetpointTransport): FakeLink => {
+      opened.push(`${epoch} ${transport}`);
+      const opening = new FakeLink();
+      opening.transport = transport;
+      return opening;
+    };
+    const offered = new DeviceStore(listed({ setpoints_over: ["mqtt", "xmpp"] }), server.api, link);
+    for (const [store, expected] of [[offered, "xmpp"], [device, "mqtt"]] as const) {
+      preferred = "xmpp";
+      const chosen = new Control(server.api, store, open, () => preferred);
+      ends.push(() => chosen.dispose());
+      expect(chosen.transport.value).toBeNull();
+      await chosen.take();
+      preferred = "mqtt";
+      await pass(LEASE_MS);
+      expect(chosen.transport.value).toBe(expected);
+      await chosen.release();
+      expect(chosen.transport.value).toBeNull();
+    }
+    expect(opened).toEqual(["5 xmpp", "5 mqtt"]);
+  });
+
+  it("says why the connection for setpoints is lost", async () => {
+    await control.take();
+    expect(blockedReason(device, control)).toBeNull();
+    setpoints.status.value = { state: "down", reason: "The cable is cut." };
+    expect(blockedReason(device, control)).toBe("No connection for setpoints: The cable is cut.");
+  });
+
+  it("keeps the choice of a transport in the browser", () => {
+    const store = new FakeStorage();
+    const preference = (): SetpointPreference => new SetpointPreference(storedTransport(store));
+    expect(preference().transport.value).toBe("mqtt");
+    preference().choose("xmpp");
+    expect(preference().transport.value).toBe("xmpp");
+    store.setItem("telescope.setpoints", '"pigeon"');
+    expect(preference().transport.value).toBe("mqtt");
   });
 
   it("is renewed every third of the lease, until it is released with its epoch", async () => {

@@ -16,8 +16,9 @@ from device_agent.protocol.security.log_output import TextFormatter
 from function_app.domain.common.problems import Problem
 from function_app.entrypoints.http.framework.responses import MAX_BODY
 from function_app.entrypoints.http.framework.responses import problem as problem_response
-from function_app.settings import Administration
+from function_app.settings import Administration, Xmpp
 from tests.fakes.clock import MovingClock
+from tests.fixtures.cloud import OpenCloud
 from tests.harness.cloud.cloud import API, Cloud, Person, problem
 from tests.harness.cloud.cloud import settings as cloud_settings
 
@@ -174,6 +175,12 @@ class TestHeaders:
         assert headers["referrer-policy"] == "no-referrer"
         assert headers["x-frame-options"] == "DENY"
         assert headers["cross-origin-opener-policy"] == "same-origin"
+
+    def test_the_policy_names_the_xmpp_server_for_browsers_and_nothing_else(self, open_cloud: OpenCloud) -> None:
+        cloud = open_cloud(xmpp=Xmpp(domain="example.org", websocket_url="wss://xmpp.example.org/xmpp-websocket"))
+        policy = cloud.request("GET", "/api/v1/nothing").headers["content-security-policy"]
+        servers = "ws://127.0.0.1:8082/mqtt wss://xmpp.example.org/xmpp-websocket"
+        assert f"; connect-src 'self' {servers}; base-uri" in policy
 
     @pytest.mark.parametrize(
         ("received", "kept"), [("a-1.b:2_C", True), ("", False), ("with space", False), ("x" * 65, False)]

@@ -11,7 +11,7 @@ from device_agent.protocol.security import signing
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
-from function_app.services.identity.authenticator import SESSION_S
+from function_app.services.identity.authenticator import ACCESS_S, API, SESSION_S
 from function_app.services.messaging.xmpp_credentials import AGENT_S, LOGIN_S, Contact, Password, XmppCredentials
 from function_app.services.storage import records
 from function_app.settings.broker import Xmpp
@@ -25,7 +25,7 @@ CLOUD_CONTACT = Contact("cloud", "Telescope")
 @pytest.fixture
 def cloud(open_cloud: OpenCloud) -> Cloud:
     """The functions with an XMPP server."""
-    cloud = open_cloud(xmpp=Xmpp(domain="example.org"))
+    cloud = open_cloud(xmpp=Xmpp(domain="example.org", websocket_url="wss://example.org/xmpp-websocket"))
     cloud.start_ingest()
     return cloud
 
@@ -87,6 +87,49 @@ def test_an_account_is_admitted_with_its_xmpp_agents(
         assert (admitted.user, admitted.name, admitted.kind) == (anna.account, "anna", "account")
         assert admitted.contacts == (CLOUD_CONTACT, Contact(robot.id, stored(robot).name))
         assert admitted.lifetime_s == LOGIN_S
+
+
+def test_a_browser_gets_a_password_and_an_access_token_that_both_expire_soon(
+    cloud: Cloud, credentials: XmppCredentials, anna: Person
+) -> None:
+    issued, token = cloud.run(credentials.browser(identity(anna)))
+    assert (issued.user, issued.lifetime_s) == (anna.account, ACCESS_S)
+    assert issued.expires_ms - cloud.clock.now_ms() == pytest.approx(ACCESS_S * 1000, abs=1000)
+    assert cloud.run(credentials.verify(anna.account, issued.password)).user == anna.account
+    caller = cloud.run(cloud.functions.authenticator.person(token, API))
+    assert (caller.account, caller.session) == (anna.account, anna.session)
+    cloud.clock.advance(ACCESS_S + 1)
+    with pytest.raises(Problem, match="expired"):
+        cloud.run(cloud.functions.authenticator.person(token, API))
+    with pytest.raises(Problem, match="expired"):
+        cloud.run(credentials.verify(anna.account, issued.password))
+
+
+def test_a_server_without_browsers_issues_no_token(open_cloud: OpenCloud) -> None:
+    cloud = open_cloud(xmpp=Xmpp(domain="example.org"))
+    anna = cloud.sign_in("anna")
+    with pytest.raises(Problem, match="TELESCOPE_XMPP_WEBSOCKET_URL") as problem:
+        cloud.run(cloud.functions.xmpp_credentials.browser(identity(anna)))
+    assert (problem.value.code, problem.value.status) == ("xmpp-unavailable", 409)
+
+
+def test_a_page_gets_a_token_only_with_its_lease(cloud: Cloud, anna: Person, robot: Robot) -> None:
+    control = {"purpose": "control", "device": robot.device, "epoch": 1}
+    refused = anna.post("/xmpp/credentials", control)
+    assert (refused.status_code, refused.json()["type"]) == (409, "/problems/lease-lost")
+    bert = cloud.sign_in("bert")
+    assert bert.post("/xmpp/credentials", control).status_code == 404
+    lease = anna.post(f"/devices/{robot.device}/lease").json()
+    issued = anna.post("/xmpp/credentials", {**control, "epoch": lease["epoch"]})
+    assert issued.status_code == 200, issued.text
+    assert issued.headers["cache-control"] == "no-store"
+    body = issued.json()
+    assert body["websocket_url"] == "wss://example.org/xmpp-websocket"
+    assert (body["jid"], body["cloud"]) == (f"{anna.account}@example.org", "cloud@example.org")
+    assert body["token"]
+    assert anna.get(f"/devices/{robot.device}").json()["setpoints_over"] == ["mqtt", "xmpp"]
+    view = anna.post("/xmpp/credentials", {"purpose": "view"}).json()
+    assert (view["token"], view["websocket_url"]) == ("", "")
 
 
 def test_an_account_with_many_agents_gets_all_as_contacts(

@@ -2,6 +2,7 @@
 import { ActionRunner } from "../../actions/model";
 import { CommandTrace } from "./command-trace";
 import { Control } from "./lease";
+import type { SetpointPreference } from "./setpoint-preference";
 import { StopSwitch } from "./stop";
 import { Watchers } from "./watchers";
 import { LatencySamples } from "../../latency/model";
@@ -14,6 +15,7 @@ export class DeviceSession {
   /** Id of this account. */
   readonly account: string;
   readonly control: Control;
+  readonly setpointPreference: SetpointPreference;
   readonly stop: StopSwitch;
   readonly actions: ActionRunner;
   readonly commandTrace: CommandTrace;
@@ -21,11 +23,12 @@ export class DeviceSession {
   readonly watchers: Watchers;
   readonly #unwatch: () => void;
 
-  constructor(api: Api, link: Link, device: DeviceStore, account: string) {
+  constructor(api: Api, link: Link, device: DeviceStore, account: string, preferred: SetpointPreference) {
     this.device = device;
     this.account = account;
     this.#unwatch = device.watchDetails();
-    this.control = new Control(api, device);
+    this.setpointPreference = preferred;
+    this.control = new Control(api, device, undefined, () => preferred.transport.value);
     this.stop = new StopSwitch(api, device, link, account);
     this.actions = new ActionRunner(api, device);
     this.commandTrace = new CommandTrace(device, this.control, this.actions);

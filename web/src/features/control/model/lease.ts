@@ -9,7 +9,8 @@ import { ControlRequest } from "./control-request";
 import { ApiError, sentence } from "../../../shared/api/http";
 import { now } from "../../../shared/lib/clock";
 import { sealed } from "../../../shared/mqtt/sealed-setpoint";
-import { MqttLink, type Link, type LinkStatus } from "../../../shared/mqtt/mqtt-link";
+import { MqttLink, type LinkStatus, type SetpointLink, type SetpointTransport } from "../../../shared/mqtt/mqtt-link";
+import { XmppLink } from "../../../shared/xmpp/xmpp-link";
 
 export const LEASE_MS = 30_000;
 const RETRY_MS = 1_000;
@@ -32,17 +33,27 @@ type ResponseState =
   | { kind: "failed"; reason: string };
 
 /** Creates the setpoint connection. */
-type OpenControlLink = (device: string, epoch: number) => Link;
+type OpenControlLink = (device: string, epoch: number, transport: SetpointTransport) => SetpointLink;
+
+/** Opens a connection of the chosen transport. */
+function controlLinks(api: Api): OpenControlLink {
+  return (device, epoch, transport) => {
+    const purpose = { purpose: "control", device, epoch } as const;
+    return transport === "xmpp" ? new XmppLink(() => api.xmppCredentials(purpose)) : new MqttLink(() => api.credentials(purpose));
+  };
+}
 
 export class Control {
   readonly #api: Api;
   readonly #device: DeviceStore;
   readonly #openLink: OpenControlLink;
+  readonly #preferred: () => SetpointTransport;
   readonly #state = signal<ControlState>({ kind: "none" });
   readonly #streamer = signal<SetpointStreamer | null>(null);
   readonly #linkStatus = signal<LinkStatus | null>(null);
+  readonly #transport = signal<SetpointTransport | null>(null);
   readonly roundTrip = new RoundTrip();
-  #link: Link | null = null;
+  #link: SetpointLink | null = null;
   #timer: ReturnType<typeof setTimeout> | undefined;
   #expiry: ReturnType<typeof setTimeout> | undefined;
   #cleanups: (() => void)[] = [];
@@ -61,12 +72,15 @@ export class Control {
   readonly streamer: ReadonlySignal<SetpointStreamer | null> = this.#streamer;
   /** The connection for setpoints; `null` without a lease. */
   readonly linkStatus: ReadonlySignal<LinkStatus | null> = this.#linkStatus;
+  /** What carries the setpoints; `null` without a lease. */
+  readonly transport: ReadonlySignal<SetpointTransport | null> = this.#transport;
 
-  constructor(api: Api, device: DeviceStore, openLink?: OpenControlLink) {
+  /** `preferred`: what carries setpoints if the site offers it; read when control is taken. */
+  constructor(api: Api, device: DeviceStore, openLink?: OpenControlLink, preferred: () => SetpointTransport = () => "mqtt") {
     this.#api = api;
     this.#device = device;
-    this.#openLink =
-      openLink ?? ((id, epoch) => new MqttLink(() => api.credentials({ purpose: "control", device: id, epoch })));
+    this.#openLink = openLink ?? controlLinks(api);
+    this.#preferred = preferred;
     // An accepted request transfers the lease to this session: only renew it.
     this.outgoingRequest = new ControlRequest(api, device, (epoch) => {
       void this.#acquire(() => api.renewLease(device.id, LEASE_MS, epoch));
@@ -77,6 +91,12 @@ export class Control {
   readonly incomingRequest = computed<OpenRequest | null>(() =>
     this.#state.value.kind === "held" ? this.#device.request.value : null,
   );
+
+  /** What will carry the setpoints of the next lease. A lease never changes its transport. */
+  get nextTransport(): SetpointTransport {
+    const preferred = this.#preferred();
+    return this.#device.info.value.setpoints_over.includes(preferred) ? preferred : "mqtt";
+  }
 
   get epoch(): number | null {
     return this.#state.value.kind === "held" ? this.#state.value.epoch : null;
@@ -169,7 +189,7 @@ export class Control {
     this.#response.value = { kind: "none" };
     this.#device.setLease({ holder: granted.holder, holder_account: "", epoch, expires_at: granted.expires_at, mine: true });
     this.roundTrip.restart();
-    const link = granted.streaming ? this.#openLink(this.#device.id, epoch) : null;
+    const link = granted.streaming ? this.#openLink(this.#device.id, epoch, this.nextTransport) : null;
     const topic = this.#device.topics.ctl(epoch);
     const streamer = new SetpointStreamer({
       epoch,
@@ -181,6 +201,7 @@ export class Control {
     this.#link = link;
     batch(() => {
       this.#streamer.value = streamer;
+      this.#transport.value = link?.transport ?? null;
       this.#state.value = { kind: "held", epoch, confirmed: granted.confirmed };
     });
     this.#renewed(granted, requestedAt);
@@ -282,6 +303,7 @@ export class Control {
     batch(() => {
       this.#streamer.value = null;
       this.#linkStatus.value = null;
+      this.#transport.value = null;
       this.#state.value = next;
     });
   }
