@@ -10,3 +10,5 @@ ROBOTS: Final = ROOT / "robots"
 UR5: Final = ROBOTS / "ur5"
 NAOQI_PYTHON: Final = Path(os.environ.get("TELESCOPE_NAOQI_PYTHON", Path(sys.prefix) / "naoqi" / "bin" / "python"))
 """Interpreter with NAOqi's library; `make test` installs it. The variable names another one."""
+LEROBOT_PYTHON: Final = Path(os.environ.get("TELESCOPE_LEROBOT_PYTHON", Path(sys.prefix) / "lerobot" / "bin" / "python"))
+"""Interpreter with LeRobot; `make test` installs it. The variable names another one."""
