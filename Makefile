@@ -120,6 +120,12 @@ tests/harness/identity_provider/node_modules/.installed: tests/harness/identity_
 	@$(BIN)/python -m pip --python .venv/naoqi/bin/python install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements/naoqi.txt
 	@touch $@
 
+# LeRobot has its own interpreter too. Some of its packages are built from source.
+.venv/.lerobot: requirements/lerobot.txt | .venv/.python
+	@$(PYTHON) -m venv --without-pip --clear .venv/lerobot
+	@$(BIN)/python -m pip --python .venv/lerobot/bin/python install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements/lerobot.txt
+	@touch $@
+
 console: web/dist/index.html
 
 web/dist/index.html: web/node_modules/.installed web/index.html web/package.json $(wildcard web/*.ts web/public/*) $(shell find web/src -type f 2>/dev/null)
@@ -135,7 +141,7 @@ system-packages:
 	@tests/system-packages
 
 test-environment: system-packages .venv/.dev console tests/harness/azurite/node_modules/.installed tests/harness/identity_provider/node_modules/.installed \
-	.venv/.azure-worker .venv/.naoqi
+	.venv/.azure-worker .venv/.naoqi .venv/.lerobot
 
 test: test-environment
 	@$(MAKE) --no-print-directory -j 2 check-python check-web

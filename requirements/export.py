@@ -14,6 +14,7 @@ EXPORTS = {
     "requirements.txt": ("functions", "azure"),
     "requirements/aws.txt": ("functions", "aws"),
     "requirements/agent.txt": ("agent", "sim", "xmpp"),
+    "requirements/lerobot.txt": ("lerobot",),
     "requirements/local.txt": ("local",),
     "requirements/naoqi.txt": ("naoqi",),
     "requirements/node.txt": ("node",),

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from device_agent.drivers.lerobot.driver import LerobotDriver
+from device_agent.drivers.lerobot.driver import LerobotDriver, LerobotMobileDriver
 from device_agent.drivers.lerobot.robots import ROBOTS
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.manifests.robot_type import RobotType
@@ -34,4 +34,5 @@ def create(robot_type: RobotType, folder: Path, options: Mapping[str, object], d
             raise DriverError(f"driver 'lerobot' needs the option '{name}'")
     if options["robot"] not in ROBOTS:
         raise DriverError(f"driver 'lerobot' has no robot '{options['robot']}'; it has: {', '.join(ROBOTS)}")
-    return LerobotDriver(robot_type, folder, options={name: str(value) for name, value in options.items()}, device=device)
+    driver = LerobotDriver if robot_type.base is None else LerobotMobileDriver
+    return driver(robot_type, folder, options={name: str(value) for name, value in options.items()}, device=device)

@@ -18,7 +18,7 @@ LOST_SHARE = 0.05
 
 
 class LerobotDriver:
-    """Drives joints, and the base of a robot that has one.
+    """Drives the joints of one robot.
 
     Args:
         robot_type: Joints with LeRobot's names, and limits. A closed gripper is at its lower limit.
@@ -88,13 +88,6 @@ class LerobotDriver:
         connection.send(values=[unit.from_rad(v) for unit, v in zip(connection.units, applied, strict=True)])
         return applied
 
-    def drive(self, twist: Twist) -> Twist:
-        """Drive with a velocity within the limits of the base."""
-        connection = self._free()
-        applied = limit_twist(self._type, twist)
-        connection.send(twist=(applied.forward_m_s, applied.left_m_s, math.degrees(applied.turn_rad_s)))
-        return applied
-
     def report(self, stream: str) -> Mapping[str, float | bool]:
         """``health``: temperature and voltage of each servo; ``odometry``: measured velocity of the base."""
         connection = self._connection
@@ -161,3 +154,14 @@ class LerobotDriver:
             message = f"{status.lost:.0%} of the servos' responses are lost; check the cables"
             faults.append(DriverFault("communication", message, stops=False))
         return tuple(faults)
+
+
+class LerobotMobileDriver(LerobotDriver):
+    """Drives joints and the base of one robot."""
+
+    def drive(self, twist: Twist) -> Twist:
+        """Drive with a velocity within the limits of the base."""
+        connection = self._free()
+        applied = limit_twist(self._type, twist)
+        connection.send(twist=(applied.forward_m_s, applied.left_m_s, math.degrees(applied.turn_rad_s)))
+        return applied
