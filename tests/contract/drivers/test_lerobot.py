@@ -13,6 +13,7 @@ from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
 from tests.harness.paths import LEROBOT_PYTHON, ROBOTS
 from tests.harness.robots.lerobot.peer import ServoPeer
+from tests.harness.robots.lerobot.types import lekiwi
 
 
 class TestSo101(DriverContract):
@@ -36,3 +37,19 @@ class TestSo101(DriverContract):
         driver = load("lerobot")(robot_type, ROBOTS / "so101", peer.options(), "arm")
         yield driver
         driver.close()
+
+
+class TestKoch(TestSo101):
+    """Dynamixel X servos; the joints have the same names."""
+
+    robot = "koch_follower"
+
+
+class TestLeKiwi(TestSo101):
+    """The arm on a base with three wheels, whose velocity the servos keep without commands."""
+
+    robot = "lekiwi"
+
+    @pytest.fixture
+    def robot_type(self) -> RobotType:
+        return lekiwi()

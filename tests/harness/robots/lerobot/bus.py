@@ -129,7 +129,8 @@ def main() -> None:
     sys.stdout.write("{}\n")
     sys.stdout.flush()
     while True:
-        sources = [sys.stdin, *([] if bus.terminal is None else [bus.terminal])]
+        # The terminal comes first, because a request may close it.
+        sources = [*([] if bus.terminal is None else [bus.terminal]), sys.stdin]
         for source in select.select(sources, [], [])[0]:
             if source is not sys.stdin:
                 bus.answer()
