@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import collections
 import importlib
-import importlib.abc
-import importlib.machinery
 import json
 import math
 import os
@@ -29,6 +27,8 @@ WATCHDOG_S = 0.25
 _PERIOD_S = 0.02
 _END_S = 1.0
 _TRIES = 3
+_LATE_MS = 150
+_QUIET_S = 0.03
 _LAG_TICKS = 65
 """Largest distance of a joint that holds from its goal, 0.1 rad [ticks]."""
 _TICKS = 4096
@@ -38,8 +38,10 @@ _HISTORY = 100
 
 UNUSED = ("cv2", "lerobot.processor", "lerobot.utils.utils")
 """Modules that LeRobot imports with its robot classes, for cameras and training. They need packages of 5 GB."""
-_FAILED = (OSError, RuntimeError, ValueError, TypeError, LookupError, termios.error)
-"""What LeRobot and the libraries of the servos raise if a packet is lost or wrong."""
+_LOST = (ConnectionError, RuntimeError, ValueError, TypeError, LookupError)
+"""What LeRobot and the libraries of the servos raise if a response is missing or wrong."""
+_FAILED = (*_LOST, OSError, termios.error)
+"""The same, and what they raise if the port is gone."""
 
 
 class Placeholder(types.ModuleType):
@@ -51,31 +53,15 @@ class Placeholder(types.ModuleType):
         return type(name, (), {})
 
 
-class PlaceholderFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds the modules that are not needed."""
-
-    def find_spec(self, name: str, path: Any, target: Any = None) -> importlib.machinery.ModuleSpec | None:
-        """See ``MetaPathFinder``."""
-        del path, target
-        return importlib.machinery.ModuleSpec(name, self) if name in UNUSED else None
-
-    def create_module(self, spec: importlib.machinery.ModuleSpec) -> Placeholder:
-        """See ``Loader``."""
-        return Placeholder(spec.name)
-
-    def exec_module(self, module: types.ModuleType) -> None:
-        """See ``Loader``."""
-
-
 class RobotError(Exception):
     """The robot cannot be used. The message is shown to operators."""
 
 
 class Robot:
-    """One robot of LeRobot. Only ``command``, ``drive`` and ``stop`` may be called by another thread."""
+    """One robot of LeRobot. Only ``accept`` and ``stop`` may be called by another thread."""
 
     def __init__(self, config: dict[str, Any]) -> None:
-        sys.meta_path.insert(0, PlaceholderFinder())
+        sys.modules.update({name: Placeholder(name) for name in UNUSED})
         try:
             robot_class = getattr(importlib.import_module(config["module"]), config["name"])
             self.robot = robot_class(
@@ -105,6 +91,7 @@ class Robot:
         self._moved_s = self._drove_s = -math.inf
         self._holding = True
         self._stopped = False
+        self._tries = _TRIES
         self._values: list[float] = []
 
     # ------------------------------------------------------------ connect
@@ -118,12 +105,16 @@ class Robot:
         try:
             self.bus.connect(handshake=False)
             self.bus.port_handler.ser.exclusive = True
+            self._extend_timeout()
         except _FAILED as error:
-            raise RobotError(f"the port {self.port} cannot be opened; check cable and rights, and end other programs") from error
+            raise RobotError(f"the port {self.port} cannot be opened; check the cable, and other programs") from error
         try:
             self._check_servos()
             self._check_calibration()
             self._prepare()
+            self._limit_speed()
+            self.retry(self.hold)
+            self._tries = 1  # from now on the next period repeats what failed
         except _FAILED as error:
             sys.stderr.write(f"lerobot bridge: {error!r}\n")
             raise RobotError("the servos respond incompletely; check cables and power") from error
@@ -143,6 +134,7 @@ class Robot:
                 model, result, _ = self.bus.packet_handler.ping(self.bus.port_handler, servo.id)
                 if result == 0:
                     break
+                self.discard()
             if result != 0:
                 missing.append(motor)
             elif model != expected:
@@ -177,18 +169,15 @@ class Robot:
         if not any(torque.values()) and not any(errors.values()):
             present = self.read_positions()
             self.bus.sync_write("Goal_Position", present, normalize=False)
-            for attempt in range(_TRIES):
-                try:
-                    self.robot.configure()
-                    break
-                except _FAILED:
-                    if attempt == _TRIES - 1:
-                        raise
-        speeds = dict(zip(self.joints, self.speeds))  # noqa: B905 (older Python)
-        self.bus.sync_write(self.registers["speed"], speeds, normalize=False)
+            self.retry(self.robot.configure)
+
+    def _limit_speed(self) -> None:
+        speeds = dict(zip(self.joints, self.speeds, strict=True))
         for _ in range(_TRIES):
-            if self.hold():
-                break
+            self.bus.sync_write(self.registers["speed"], speeds, normalize=False)
+            if self.read(self.registers["speed"], self.joints) == speeds:
+                return
+        raise ValueError("the servos reject their speed")
 
     def description(self) -> dict[str, Any]:
         """Units and servos."""
@@ -203,26 +192,24 @@ class Robot:
 
     # ------------------------------------------------------------ commands, from any thread
 
-    def command(self, values: list[float]) -> None:
-        """Move the joints."""
+    def accept(self, command: dict[str, Any]) -> None:
+        """Note a command: ``values`` move the joints, ``twist`` moves the base until the next one."""
+        if "hold" in command:
+            self.stop()
         with self._lock:
-            if not self._stopped:
-                self._target, self._pending, self._holding = values, True, False
-                self._moved_s = time.monotonic()
-
-    def drive(self, twist: list[float]) -> None:
-        """Move the base until the next command."""
-        with self._lock:
-            if not self._stopped:
-                self._twist, self._pending = twist, True
-                self._drove_s = time.monotonic()
+            if self._stopped:
+                return
+            self._pending = True
+            if "values" in command:
+                self._target, self._holding, self._moved_s = command["values"], False, time.monotonic()
+            else:
+                self._twist, self._drove_s = command["twist"], time.monotonic()
 
     def stop(self) -> None:
         """Hold, and reject all later commands."""
         with self._lock:
             self._stopped = self._holding = True
             self._pending = False
-            self._twist = [0.0, 0.0, 0.0]
 
     @property
     def holds(self) -> bool:
@@ -233,8 +220,38 @@ class Robot:
 
     def read(self, register: str, motors: list[str]) -> dict[str, int]:
         """Registers of several servos, in their units. Raises one of ``_FAILED``."""
-        values: dict[str, int] = self.bus.sync_read(register, motors, normalize=False, num_retry=1)
+        values: dict[str, int] = self.retry(lambda: self.bus.sync_read(register, motors, normalize=False))
         return values
+
+    def retry(self, call: Any) -> Any:
+        """The result of a call, which may be repeated. Raises one of ``_FAILED`` if each attempt fails."""
+        for _ in range(self._tries - 1):
+            try:
+                return call()
+            except _LOST:
+                self.discard()
+        return call()
+
+    def discard(self) -> None:
+        """Discard late responses. A response names no request: LeRobot would take them for those of the next one."""
+        serial = self.bus.port_handler.ser
+        while True:
+            time.sleep(_QUIET_S)
+            if not serial.in_waiting:
+                self.bus.port_handler.is_using = False
+                return
+            serial.reset_input_buffer()
+
+    def _extend_timeout(self) -> None:
+        """Wait longer for a response than LeRobot, which gives up after 34 to 50 ms, also on a computer under load."""
+        port = self.bus.port_handler
+        set_timeout = port.setPacketTimeout
+
+        def extended(length: int) -> None:
+            set_timeout(length)
+            port.packet_timeout += _LATE_MS
+
+        port.setPacketTimeout = extended
 
     def read_positions(self) -> dict[str, int]:
         """Measured positions [ticks]. Raises one of ``_FAILED``, also for values that no encoder measures."""
@@ -281,9 +298,9 @@ class Robot:
         return {"type": "measurement", "at_s": at_s, "values": self._values, "twist": twist}
 
     def _send(self, values: list[float], twist: list[float]) -> None:
-        action = {f"{joint}.pos": value for joint, value in zip(self.joints, values)}  # noqa: B905 (older Python)
+        action = {f"{joint}.pos": value for joint, value in zip(self.joints, values, strict=True)}
         if self.wheels:
-            action.update(zip(("x.vel", "y.vel", "theta.vel"), twist))  # noqa: B905 (older Python)
+            action.update(zip(("x.vel", "y.vel", "theta.vel"), twist, strict=True))
         self.robot.send_action(action)
 
 
@@ -308,7 +325,7 @@ class Bridge:
         threading.Thread(target=self._work, args=(robot,), daemon=True).start()
         try:
             for line in iter(lambda: lines.readline(_MAX_LINE), b""):
-                self._accept(robot, json.loads(line))
+                robot.accept(json.loads(line))
         except (OSError, ValueError, KeyError) as error:
             sys.stderr.write(f"lerobot bridge: {error!r}\n")
         robot.stop()
@@ -322,31 +339,25 @@ class Bridge:
         except OSError:
             return  # the main thread notices it too, and stops the robot
 
-    def _accept(self, robot: Robot, command: dict[str, Any]) -> None:
-        if "values" in command:
-            robot.command(command["values"])
-        elif "twist" in command:
-            robot.drive(command["twist"])
-        elif "hold" in command:
-            robot.stop()
-
     def _work(self, robot: Robot) -> None:
         """Use the bus. Ends the process if the port is gone."""
         status = StatusReader(robot)
         due_s = time.monotonic()
         while True:
             try:
+                if status.results and not status.results[-1]:
+                    robot.discard()
                 robot.execute()
                 self.send(robot.measure())
                 message = status.read()
                 if message is not None:
                     self.send(message)
                 status.results.append(True)
-            except _FAILED as error:
+            except _LOST:
                 status.results.append(False)
-                if isinstance(error, (OSError, termios.error)) and not isinstance(error, ConnectionError):
-                    self.send({"type": "failure", "message": f"the port {robot.port} is gone; check the cable"})
-                    os._exit(1)
+            except (OSError, termios.error):
+                self.send({"type": "failure", "message": f"the port {robot.port} is gone; check the cable"})
+                os._exit(1)
             if robot.holds:
                 self._held.set()
             now_s = time.monotonic()
@@ -355,14 +366,7 @@ class Bridge:
 
 
 class StatusReader:
-    """Reads the servos' status, one register in each period.
-
-    Args:
-        robot: The connected robot.
-
-    Attributes:
-        results: Whether each of the last periods succeeded.
-    """
+    """Reads the servos' status, one register in each period. ``results``: whether each of the last ones succeeded."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot

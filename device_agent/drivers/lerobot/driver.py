@@ -95,7 +95,9 @@ class LerobotDriver:
             return {}
         status, motors = connection.status, connection.motors
         if stream == "health":
-            temperatures = {f"temperature_c.{name}": float(c) for name, c in zip(motors, status.temperature, strict=True)}
+            temperatures = {
+                f"temperature_c.{name}": float(c) for name, c in zip(motors, status.temperature, strict=True)
+            }
             return temperatures | {f"voltage_v.{name}": v / 10 for name, v in zip(motors, status.voltage, strict=True)}
         if stream == "odometry" and self._settings.base:
             return connection.measurement.twist._asdict()

@@ -102,17 +102,15 @@ class Bus:
         """The bytes that arrive instead of a reply."""
         if self._drop_every and next(self._replies) % self._drop_every == 0:
             return b""
-        match self._disturbance:
-            case "silence":
-                return b""
-            case "garbage":
-                return self._random.randbytes(len(reply))
-            case "truncated":
-                return reply[: len(reply) // 2]
-            case "checksum":
-                return reply[:-1] + bytes((reply[-1] ^ 1,))
-            case "clock":  # an adapter that hangs repeats its buffer
-                return self._last
+        spoiled = {
+            "silence": b"",
+            "garbage": self._random.randbytes(len(reply)),
+            "truncated": reply[: len(reply) // 2],
+            "checksum": reply[:-1] + bytes((reply[-1] ^ 1,)),
+            "clock": self._last,  # an adapter that hangs repeats its buffer
+        }
+        if self._disturbance in spoiled:
+            return spoiled[self._disturbance]
         self._last = reply
         return reply
 

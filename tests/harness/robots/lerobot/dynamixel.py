@@ -81,11 +81,9 @@ def execute(packet: bytes, servos: Mapping[int, Servo], read: Callable[[Servo, i
     servo = servos.get(servo_id)
     if servo is None:
         return []
-    if instruction == _PING:
-        return [reply(servo_id, servo.error, servo.memory[0:2] + servo.memory[6:7])]
-    if instruction == _READ:
-        return [reply(servo_id, servo.error, read(servo, address, size))]
     if instruction == _WRITE:
         servo.write(address, parameters[2:])
-        return [reply(servo_id, servo.error, b"")]
-    return []
+    data = read(servo, address, size) if instruction == _READ else b""
+    if instruction == _PING:
+        data = bytes(servo.memory[0:2] + servo.memory[6:7])
+    return [reply(servo_id, servo.error, data)]

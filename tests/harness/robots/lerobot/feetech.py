@@ -29,7 +29,7 @@ TABLE = Table(
 )  # fmt: skip
 DEFAULTS = {"Model_Number": MODEL, "Firmware_Major_Version": 3, "Firmware_Minor_Version": 10}
 _BROADCAST = 254
-_PING, _READ, _WRITE, _SYNC_READ, _SYNC_WRITE = 1, 2, 3, 0x82, 0x83
+_READ, _WRITE, _SYNC_READ, _SYNC_WRITE = 2, 3, 0x82, 0x83
 
 
 def checksum(body: bytes) -> int:
@@ -72,11 +72,7 @@ def execute(packet: bytes, servos: Mapping[int, Servo], read: Callable[[Servo, i
         return []
     if servo is None or servo_id == _BROADCAST:
         return []
-    if instruction == _PING:
-        return [reply(servo_id, servo.error, b"")]
-    if instruction == _READ:
-        return [reply(servo_id, servo.error, read(servo, parameters[0], parameters[1]))]
     if instruction == _WRITE:
         servo.write(parameters[0], parameters[1:])
-        return [reply(servo_id, servo.error, b"")]
-    return []
+    data = read(servo, parameters[0], parameters[1]) if instruction == _READ else b""
+    return [reply(servo_id, servo.error, data)]

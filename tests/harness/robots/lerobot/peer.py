@@ -5,7 +5,6 @@ import math
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +38,7 @@ class ServoPeer:
         torque: Whether the servos have torque at the start.
     """
 
-    def __init__(
-        self, robot_type: RobotType, robot: str, python: Path, folder: Path, *, torque: bool = False
-    ) -> None:
+    def __init__(self, robot_type: RobotType, robot: str, python: Path, folder: Path, *, torque: bool = False) -> None:
         self._robot = robot
         self._python = python
         self._joints = robot_type.joints
@@ -106,10 +103,6 @@ class ServoPeer:
             request["set"] = {names[name]: values for name, values in request["set"].items()}
         state = self._exchange(request)
         return {name: state[index] for name, index in names.items()}
-
-    def set_all(self, registers: Mapping[str, int]) -> None:
-        """Change registers of every servo."""
-        self.state(set=dict.fromkeys(self._names(), dict(registers)))
 
     def joint_positions(self) -> tuple[float, ...]:
         """See ``Peer``."""
