@@ -1,4 +1,4 @@
-"""Driver of robots with LeRobot's robot classes. The library ``lerobot`` runs in a process of its own: ``bridge.py``."""
+"""Driver of LeRobot's robots. The library ``lerobot`` runs in a process of its own: ``bridge.py``."""
 
 from collections.abc import Mapping
 from pathlib import Path

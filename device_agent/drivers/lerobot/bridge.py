@@ -220,8 +220,7 @@ class Robot:
 
     def read(self, register: str, motors: list[str]) -> dict[str, int]:
         """Registers of several servos, in their units. Raises one of ``_FAILED``."""
-        values: dict[str, int] = self.retry(lambda: self.bus.sync_read(register, motors, normalize=False))
-        return values
+        return dict(self.retry(lambda: self.bus.sync_read(register, motors, normalize=False)))
 
     def retry(self, call: Any) -> Any:
         """The result of a call, which may be repeated. Raises one of ``_FAILED`` if each attempt fails."""
