@@ -13,7 +13,7 @@ from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
 from tests.harness.paths import LEROBOT_PYTHON, ROBOTS
 from tests.harness.robots.lerobot.peer import ServoPeer
-from tests.harness.robots.lerobot.types import lekiwi
+from tests.harness.robots.lerobot.robot_types import lekiwi
 
 
 class TestSo101(DriverContract):

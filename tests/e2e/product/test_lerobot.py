@@ -66,7 +66,7 @@ def key(machine: Machine) -> str:
 @contextlib.contextmanager
 def plugin(machine: Machine, packages: Path, kind: str, key: str, device: str = "ur5") -> Iterator[Plugin]:
     process = subprocess.Popen(
-        [LEROBOT_PYTHON, PROGRAM, BRIDGE, kind, machine.url, device],
+        [LEROBOT_PYTHON, "-P", PROGRAM, BRIDGE, kind, machine.url, device],
         env={
             **os.environ,
             "PYTHONPATH": str(packages),
@@ -154,11 +154,12 @@ def test_it_moves_nothing_without_a_lease(machine: Machine, packages: Path, key:
 
 
 def test_a_wrong_device_and_a_wrong_key_are_described(machine: Machine, packages: Path, key: str) -> None:
-    with plugin(machine, packages, "robot", key, "arm") as robot:
-        with pytest.raises(PluginError, match="no device 'arm'; this API key sees: ur5"):
+    for token, device, message in (
+        (key, "arm", "no device 'arm'; this API key sees: ur5"),
+        ("", "ur5", "set TELESCOPE_TOKEN"),
+    ):
+        with plugin(machine, packages, "robot", token, device) as robot, pytest.raises(PluginError, match=message):
             robot.call("connect")
-    with plugin(machine, packages, "robot", "") as robot, pytest.raises(PluginError, match="set TELESCOPE_TOKEN"):
-        robot.call("connect")
 
 
 def test_a_device_is_a_teleoperator_without_a_lease(machine: Machine, packages: Path, key: str) -> None:
