@@ -58,7 +58,7 @@ class Bus:
         self._drop_every = request.get("drop_every", self._drop_every)
         for servo_id, values in request.get("set", {}).items():
             self._set(self.servos[int(servo_id)], values)
-        return {servo_id: self._state(servo) for servo_id, servo in self.servos.items()}
+        return {str(servo_id): self._state(servo) for servo_id, servo in self.servos.items()}
 
     def close(self) -> None:
         """Remove the terminal."""
@@ -130,7 +130,7 @@ def main() -> None:
         # The terminal comes first, because a request may close it.
         sources = [*([] if bus.terminal is None else [bus.terminal]), sys.stdin]
         for source in select.select(sources, [], [])[0]:
-            if source is not sys.stdin:
+            if isinstance(source, int):
                 bus.answer()
             elif line := sys.stdin.readline():
                 sys.stdout.write(json.dumps(bus.control(json.loads(line))) + "\n")
