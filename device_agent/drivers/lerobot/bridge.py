@@ -8,7 +8,9 @@ for ``WATCHDOG_S``, it stops the robot. One thread uses the bus.
 from __future__ import annotations
 
 import collections
+import contextlib
 import importlib
+import itertools
 import json
 import math
 import os
@@ -27,8 +29,7 @@ WATCHDOG_S = 0.25
 _PERIOD_S = 0.02
 _END_S = 1.0
 _TRIES = 3
-_LATE_MS = 150
-_QUIET_S = 0.03
+_LATE_MS = 100
 _LAG_TICKS = 65
 """Largest distance of a joint that holds from its goal, 0.1 rad [ticks]."""
 _TICKS = 4096
@@ -92,6 +93,7 @@ class Robot:
         self._holding = True
         self._stopped = False
         self._tries = _TRIES
+        self._markers = itertools.cycle(range(10, 90, 4))
         self._values: list[float] = []
 
     # ------------------------------------------------------------ connect
@@ -134,7 +136,7 @@ class Robot:
                 model, result, _ = self.bus.packet_handler.ping(self.bus.port_handler, servo.id)
                 if result == 0:
                     break
-                self.discard()
+                self.bus.port_handler.ser.reset_input_buffer()
             if result != 0:
                 missing.append(motor)
             elif model != expected:
@@ -160,10 +162,7 @@ class Robot:
                 )
 
     def _prepare(self) -> None:
-        """Hold. Servos without torque are configured, and get their present position as goal first.
-
-        If some have torque and others not, nothing changes: LeRobot's configuration would drop the arm.
-        """
+        """Configure servos without torque; their goal is their position. If some have it, that would drop the arm."""
         torque = self.read("Torque_Enable", self.motors)
         errors = self.read(self.registers["errors"], self.motors)
         if not any(torque.values()) and not any(errors.values()):
@@ -219,7 +218,7 @@ class Robot:
     # ------------------------------------------------------------ bus, from one thread
 
     def read(self, register: str, motors: list[str]) -> dict[str, int]:
-        """Registers of several servos, in their units. Raises one of ``_FAILED``."""
+        """Registers of several servos. Raises one of ``_FAILED``."""
         return dict(self.retry(lambda: self.bus.sync_read(register, motors, normalize=False)))
 
     def retry(self, call: Any) -> Any:
@@ -228,21 +227,27 @@ class Robot:
             try:
                 return call()
             except _LOST:
-                self.discard()
+                with contextlib.suppress(ConnectionError):
+                    self.resynchronize()
         return call()
 
-    def discard(self) -> None:
-        """Discard late responses. A response names no request: LeRobot would take them for those of the next one."""
-        serial = self.bus.port_handler.ser
-        while True:
-            time.sleep(_QUIET_S)
-            if not serial.in_waiting:
-                self.bus.port_handler.is_using = False
-                return
-            serial.reset_input_buffer()
+    def resynchronize(self) -> None:
+        """Discard late responses, which LeRobot would take for those of the next request: they name none.
+
+        They arrive before that of a marker, a read of a length that nothing else has. Raises one of ``_FAILED``.
+        """
+        handler, port, servo = self.bus.packet_handler, self.bus.port_handler, self.bus.ids[0]
+        port.is_using = False
+        size = next(self._markers)
+        handler.readTx(port, servo, 0, size)
+        data, result = [], 0
+        while result == 0 and len(data) != size:
+            data, result, _ = handler.readRx(port, servo, size)
+        if result != 0:
+            raise ConnectionError("no response")
 
     def _extend_timeout(self) -> None:
-        """Wait longer for a response than LeRobot, which gives up after 34 to 50 ms, also on a computer under load."""
+        """Wait longer for a response than LeRobot: 34 to 50 ms are too short on a computer under load."""
         port = self.bus.port_handler
         set_timeout = port.setPacketTimeout
 
@@ -275,10 +280,7 @@ class Robot:
             self._send(target or self._values, twist)
 
     def hold(self) -> bool:
-        """Keep goals near the measured position, which carry the load; other joints stay where they are.
-
-        Returns whether the servos had these goals already.
-        """
+        """Keep goals near the measured position, which carry the load; others stop. Returns whether all did already."""
         present, goal = self.read_positions(), self.read("Goal_Position", self.joints)
         changed = {joint: now for joint, now in present.items() if abs(goal[joint] - now) > _LAG_TICKS}
         if changed:
@@ -331,12 +333,9 @@ class Bridge:
         self._held.wait(_END_S)
 
     def send(self, message: dict[str, Any]) -> None:
-        """Send a message, unless the agent has gone."""
-        data = json.dumps(message, allow_nan=False).encode() + b"\n"
-        try:
-            self._link.sendall(data)
-        except OSError:
-            return  # the main thread notices it too, and stops the robot
+        """Send a message, unless the agent has gone: the main thread notices it too, and stops the robot."""
+        with contextlib.suppress(OSError):
+            self._link.sendall(json.dumps(message, allow_nan=False).encode() + b"\n")
 
     def _work(self, robot: Robot) -> None:
         """Use the bus. Ends the process if the port is gone."""
@@ -345,7 +344,7 @@ class Bridge:
         while True:
             try:
                 if status.results and not status.results[-1]:
-                    robot.discard()
+                    robot.resynchronize()
                 robot.execute()
                 self.send(robot.measure())
                 message = status.read()

@@ -39,14 +39,12 @@ class TestSo101(DriverContract):
         driver.close()
 
 
-@pytest.mark.sampled
 class TestKoch(TestSo101):
     """Dynamixel X servos; the joints have the same names."""
 
     robot = "koch_follower"
 
 
-@pytest.mark.sampled
 class TestLeKiwi(TestSo101):
     """The arm on a base with three wheels, whose velocity the servos keep without commands."""
 

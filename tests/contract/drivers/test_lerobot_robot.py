@@ -313,6 +313,38 @@ def test_lost_responses_are_shown_while_the_robot_continues(peer: ServoPeer, dri
     until(lambda: driver.faults() == ())
 
 
+@pytest.mark.parametrize("robot", ["so101_follower", "koch_follower"])
+def test_late_responses_are_not_taken_for_others(robot: str, tmp_path: Path) -> None:
+    peer = ServoPeer(SO101, robot, LEROBOT_PYTHON, tmp_path)
+    driver = create(peer)
+    seen: set[object] = set()
+    try:
+        driver.connect()
+        connection = driver._connection
+        assert connection is not None
+        before = driver.observe().position_rad
+
+        def next_status() -> float:
+            """Wait for a new status; note what is wrong in it."""
+            connection.status = None
+            until(lambda: connection.status is not None)
+            seen.update(fault for fault in driver.faults() if fault.code != "communication")
+            seen.update(item for item in driver.report("health").items() if item[1] not in {31.0, 12.1})
+            assert driver.observe().position_rad == pytest.approx(before, abs=0.01)
+            return connection.status.lost if connection.status else 0.0
+
+        for _ in range(8):  # each time the responses to another request may be late
+            lost_before = next_status()
+            peer.state(late=True)
+            until(lambda lost_before=lost_before: next_status() > lost_before)
+            for _ in range(3):
+                next_status()
+        assert seen == set()
+    finally:
+        driver.close()
+        peer.close()
+
+
 def test_a_wrong_checksum_is_no_measurement(peer: ServoPeer, driver: LerobotDriver) -> None:
     peer.disturb("checksum")
     until(lambda: lost(driver))

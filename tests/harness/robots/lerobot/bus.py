@@ -35,6 +35,8 @@ class Bus:
         self._disturbance = ""
         self._drop_every = 0
         self._last = b""
+        self._late = False
+        self._held_back = b""
         self.terminal: int | None = None
         self._other = -1
         self._open()
@@ -44,10 +46,13 @@ class Bus:
         assert self.terminal is not None
         packets, self._received = self._protocol.split(self._received + os.read(self.terminal, 4096))
         for packet in packets:
-            for reply in self._protocol.execute(packet, self.servos, self._read):
-                sent = self._disturb(reply)
-                if sent:
-                    os.write(self.terminal, sent)
+            replies = self._protocol.execute(packet, self.servos, self._read)
+            sent = b"".join(map(self._disturb, replies))
+            if self._late and replies:
+                self._late, self._held_back = False, sent
+            elif sent:
+                os.write(self.terminal, self._held_back + sent)
+                self._held_back = b""
 
     def control(self, request: dict[str, Any]) -> dict[str, Any]:
         """Execute a request; returns the state of all servos."""
@@ -56,6 +61,7 @@ class Bus:
         if request.get("restore"):
             self._restore()
         self._drop_every = request.get("drop_every", self._drop_every)
+        self._late = request.get("late", self._late)
         for servo_id, values in request.get("set", {}).items():
             self._set(self.servos[int(servo_id)], values)
         return {str(servo_id): self._state(servo) for servo_id, servo in self.servos.items()}
