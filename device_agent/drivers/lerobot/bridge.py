@@ -240,9 +240,10 @@ class Robot:
         port.is_using = False
         size = next(self._markers)
         handler.readTx(port, servo, 0, size)
-        data, result = [], 0
-        while result == 0 and len(data) != size:
+        length, result = 0, 0
+        while result == 0 and length != size:
             data, result, _ = handler.readRx(port, servo, size)
+            length = len(data)
         if result != 0:
             raise ConnectionError("no response")
 
