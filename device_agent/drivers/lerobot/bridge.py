@@ -24,16 +24,14 @@ import types
 from pathlib import Path
 from typing import Any
 
-WATCHDOG_S = 0.25
-"""Longest time between two commands [s]."""
+WATCHDOG_S = 0.25  # between two commands
 _PERIOD_S = 0.02
 _END_S = 1.0
 _TRIES = 3
 _LATE_MS = 100
 _LAG_TICKS = 65
 """Largest distance of a joint that holds from its goal, 0.1 rad [ticks]."""
-_TICKS = 4096
-"""Ticks of a turn."""
+_TICKS = 4096  # of a turn
 _MAX_LINE = 65536
 _HISTORY = 100
 
@@ -41,8 +39,7 @@ UNUSED = ("cv2", "lerobot.processor", "lerobot.utils.utils")
 """Modules that LeRobot imports with its robot classes, for cameras and training. They need packages of 5 GB."""
 _LOST = (ConnectionError, RuntimeError, ValueError, TypeError, LookupError)
 """What LeRobot and the libraries of the servos raise if a response is missing or wrong."""
-_FAILED = (*_LOST, OSError, termios.error)
-"""The same, and what they raise if the port is gone."""
+_FAILED = (*_LOST, OSError, termios.error)  # also if the port is gone
 
 
 class Placeholder(types.ModuleType):
@@ -240,12 +237,15 @@ class Robot:
         port.is_using = False
         size = next(self._markers)
         handler.readTx(port, servo, 0, size)
-        length, result = 0, 0
-        while result == 0 and length != size:
-            data, result, _ = handler.readRx(port, servo, size)
-            length = len(data)
-        if result != 0:
-            raise ConnectionError("no response")
+        for _ in range(_TRIES):
+            length, result = 0, 0
+            while result == 0 and length != size:
+                data, result, _ = handler.readRx(port, servo, size)
+                length = len(data)
+            if result == 0:
+                return
+            port.setPacketTimeout(size)
+        raise ConnectionError("no response")
 
     def _extend_timeout(self) -> None:
         """Wait longer for a response than LeRobot: 34 to 50 ms are too short on a computer under load."""

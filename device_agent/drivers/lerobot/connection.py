@@ -18,7 +18,7 @@ from device_agent.drivers.lerobot.units import JointUnit, positions_rad
 from device_agent.ports.driver import Twist, UnreachableError
 from device_agent.ports.threads import SupervisedThread
 
-_START_S = 8.0
+_START_S = 9.0
 """Time until the first measurement [s]; it includes the start of the bridge's Python."""
 _OLD_S = 1.0
 _END_S = 2.0
