@@ -127,6 +127,12 @@ tests/harness/identity_provider/node_modules/.installed: tests/harness/identity_
 	@$(call install,requirements/naoqi.txt,.venv/naoqi/bin/python)
 	@touch $@
 
+# LeRobot has its own interpreter too. Some of its packages are built from source.
+.venv/.lerobot: requirements/lerobot.txt | .venv/.python
+	@$(PYTHON) -m venv --without-pip --clear .venv/lerobot
+	@$(call install,requirements/lerobot.txt,.venv/lerobot/bin/python)
+	@touch $@
+
 console: web/dist/index.html
 
 web/dist/index.html: web/node_modules/.installed web/index.html web/package.json $(wildcard web/*.ts web/public/*) $(shell find web/src -type f 2>/dev/null)
@@ -146,7 +152,7 @@ test-environment: system-packages
 	@$(MAKE) --no-print-directory -j 3 test-packages
 
 test-packages: .venv/.dev console tests/harness/azurite/node_modules/.installed tests/harness/identity_provider/node_modules/.installed \
-	.venv/.azure-worker .venv/.naoqi
+	.venv/.azure-worker .venv/.naoqi .venv/.lerobot
 
 test: test-environment
 	@$(MAKE) --no-print-directory -j 2 check-python check-web

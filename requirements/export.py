@@ -15,6 +15,7 @@ EXPORTS = {
     "requirements/aws.txt": ("functions", "aws"),
     "requirements/agent.txt": ("agent", "sim", "xmpp", "ros"),
     "requirements/agent-build.txt": ("agent-build",),
+    "requirements/lerobot.txt": ("lerobot",),
     "requirements/local.txt": ("local",),
     "requirements/naoqi.txt": ("naoqi",),
     "requirements/node.txt": ("node",),

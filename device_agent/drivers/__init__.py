@@ -15,7 +15,9 @@ from device_agent.protocol.manifests.robot_type import RobotType
 __all__ = ["GROUP", "Factory", "load", "names"]
 
 GROUP = "telescope.drivers"
-_BUILT_IN: Mapping[str, str] = {name: f"device_agent.drivers.{name}" for name in ("mujoco", "naoqi", "ros", "ur")}
+_BUILT_IN: Mapping[str, str] = {
+    name: f"device_agent.drivers.{name}" for name in ("lerobot", "mujoco", "naoqi", "ros", "ur")
+}
 """Name → module that defines ``create``."""
 
 

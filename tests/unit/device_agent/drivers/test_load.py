@@ -25,7 +25,7 @@ def third_party(monkeypatch: pytest.MonkeyPatch, **points: str) -> None:
 
 def test_unknown_driver_error_lists_the_valid_names(monkeypatch: pytest.MonkeyPatch):
     third_party(monkeypatch, acme="acme:create")
-    with pytest.raises(DriverError, match=r"no driver 'mujco'; there are: acme, mujoco"):
+    with pytest.raises(DriverError, match=r"no driver 'mujco'; there are: acme, lerobot, mujoco"):
         drivers.load("mujco")
 
 

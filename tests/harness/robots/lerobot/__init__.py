@@ -1,0 +1,1 @@
+"""Emulated servo buses of robots that LeRobot drives: Feetech STS and Dynamixel X on a pseudo-terminal."""
