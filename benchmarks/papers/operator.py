@@ -129,7 +129,7 @@ class Path:
     def __init__(
         self,
         robot: _MqttRobot | _XmppRobot,
-        publish: Callable[[str, bytes], None],
+        publish: Callable[[str, bytes], object],
         answers: "queue.SimpleQueue[bytes]",
         lease: dict[str, Any],
     ) -> None:

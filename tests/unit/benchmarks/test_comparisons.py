@@ -95,8 +95,8 @@ def test_peers_receive_the_same_setpoint() -> None:
 
 
 def operator_with_response(offset: int) -> operators.PeerOperator:
-    operator = operators.PeerOperator(lambda sequence: operator.on_applied(sequence + offset))
-    return operator
+    peer = operators.PeerOperator(lambda sequence: peer.on_applied(sequence + offset))
+    return peer
 
 
 def test_an_exchange_ends_with_its_own_response_only(monkeypatch: pytest.MonkeyPatch) -> None:
