@@ -12,9 +12,9 @@ from typing import Any
 
 import msgspec
 
-from device_agent.middleware.bridge_process import BridgeProcess
 from device_agent.drivers.lerobot.robots import ROBOTS
 from device_agent.drivers.lerobot.units import JointUnit, positions_rad
+from device_agent.middleware.bridge_process import BridgeProcess
 from device_agent.ports.driver import Twist, UnreachableError
 from device_agent.ports.threads import SupervisedThread
 
