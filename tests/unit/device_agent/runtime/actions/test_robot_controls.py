@@ -1,5 +1,6 @@
 """Values of a robot besides joints that operators set."""
 
+import threading
 from collections.abc import Sequence
 
 import pytest
@@ -12,16 +13,22 @@ from tests.unit.device_agent.runtime.conftest import MakeDevice
 
 
 class Tool(FakeDriver):
-    """A robot with a lamp, whose brightness it rounds, and a gripper that jams."""
+    """A robot with a lamp, whose brightness it rounds, and a gripper that jams once it is ``released``."""
 
     controls: Sequence[Control] = (
         Control(name="lamp", label="Lamp", lower=0, upper=1),
         Control(name="gripper", label="Gripper", lower=0, upper=1),
     )
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.entered, self.released = threading.Event(), threading.Event()
+
     def set_control(self, name: str, value: float, context: BehaviourContext) -> float:
         if name == "gripper":
-            context.wait(60)
+            self.entered.set()
+            while not self.released.is_set() and not context.wait(0.01):
+                pass
             raise SkillError("the gripper is jammed")
         return round(value, 1)
 
@@ -41,11 +48,20 @@ def test_a_value_is_set_within_its_limits_and_the_applied_one_is_reported(make_d
 
 
 def test_stop_ends_the_setting_of_a_value(make_device: MakeDevice) -> None:
-    harness = make_device(driver=Tool())
+    tool = Tool()
+    harness = make_device(driver=tool)
     running = harness.running(SetControl(control="gripper", value=1.0), epoch=1)
+    assert tool.entered.wait(60)
     harness.receive_stop()
     assert harness.end_code(running) == "stopped"
     assert harness.failed(SetControl(control="lamp", value=1.0), epoch=2).code == "stopped"
+
+
+def test_a_value_that_the_robot_does_not_reach_fails_the_action(make_device: MakeDevice) -> None:
+    tool = Tool()
+    tool.released.set()
+    reason = make_device(driver=tool).failed(SetControl(control="gripper", value=1.0), epoch=1)
+    assert (reason.code, reason.message) == ("skill_failed", "the gripper is jammed")
 
 
 @pytest.mark.parametrize("controls", [None, ()])
