@@ -10,7 +10,7 @@ import msgspec
 
 from device_agent import drivers, geometry, sensors
 from device_agent.config.agent_config import AgentConfig, DeviceEntry
-from device_agent.config.catalogue import ROOMS, TYPES, enrolled_devices, room_device_of, type_of
+from device_agent.config.catalogue import ROOMS, TYPES, enrolled_devices, folder_of, room_device_of, type_of
 from device_agent.config.client_certificate import ClientCertificate
 from device_agent.config.errors import ConfigError
 from device_agent.config.identity_store import IdentityStore, Pairing
@@ -158,7 +158,7 @@ def create_room_device(
     """Create a room device, not connected; ``None`` for a robot.
 
     Args:
-        entry: The device; its options override those of the room's manifest.
+        entry: The device; its options override those of the manifest.
         neighbours: The agent's room drivers by name, completed while they are created.
         uploads: Destination of captures.
         faults: Folder of injected faults of simulated devices, ``{device}.toml`` each.
@@ -175,14 +175,14 @@ def create_room_device(
         options.setdefault("faults", str(faults / f"{entry.name}.toml"))
     manifest = msgspec.structs.replace(device, label=entry.label or device.label, driver=driver, options=options)
     try:
-        sensor = sensors.load(driver)(manifest, ROOMS.folder(entry.room), _surroundings(entry.room, neighbours))
+        sensor = sensors.load(driver)(manifest, folder_of(entry), _surroundings(entry.room, neighbours))
         return RoomDevice(sensor, manifest, uploads)
     except SensorError as error:
         raise ConfigError(str(error)) from error
 
 
 def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundings:
-    if not ROOMS.load(room).model:
+    if not room or not ROOMS.load(room).model:
         return Surroundings(neighbours=neighbours)
     from device_agent.simulation import world_registry  # noqa: PLC0415 (a real room needs no simulation)
 

@@ -57,6 +57,8 @@ def _devices(options: argparse.Namespace) -> int:
         print(error)
     for name in catalogue.TYPES.folders():
         print(f"type    {name}: {catalogue.TYPES.load(name).label}")
+    for name in catalogue.DEVICES.folders():
+        print(f"type    {name}: {catalogue.DEVICES.load(name).label}")
     for name in catalogue.ROOMS.folders():
         print(f"room    {name}: {catalogue.ROOMS.load(name).label}")
     for name in drivers.names():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from device_agent import bootstrap, drivers
+from device_agent import bootstrap, drivers, sensors
 from device_agent.cli import claim_prompt, robot_types, systemd
 from device_agent.cli.arguments import Commands, add_home, add_no_qr
 from device_agent.config import catalogue
@@ -37,7 +37,7 @@ def add_commands(commands: Commands, home: Path) -> None:
         action="append",
         metavar="NAME=TYPE[:DRIVER]",
         default=[],
-        help="a device of this agent, for example arm=ur5; may be repeated",
+        help="a device of this agent, for example arm=ur5 or door=camera:rtsp; may be repeated",
     )
     parser.add_argument(
         "--room",
@@ -156,6 +156,8 @@ def _device(text: str) -> DeviceEntry:
     robot_type, _, driver = rest.partition(":")
     if not equals or not is_id(name):
         raise ConfigError(f"'{text}' is not NAME=TYPE; a name matches {ID_PATTERN}")
+    if catalogue.is_device_type(robot_type):
+        return _room_device(name, robot_type, driver)
     known = catalogue.TYPES.folders()
     label = catalogue.TYPES.load(robot_type).label if robot_type in known else ""
     if not is_id(robot_type):
@@ -169,3 +171,10 @@ def _device(text: str) -> DeviceEntry:
     if driver:
         drivers.load(driver)
     return DeviceEntry(name=name, type=robot_type, driver=driver, label=label)
+
+
+def _room_device(name: str, device_type: str, driver: str) -> DeviceEntry:
+    if driver and driver not in sensors.names():
+        raise ConfigError(f"no sensor driver '{driver}'; there are: {', '.join(sensors.names())}")
+    label = catalogue.DEVICES.load(device_type).label
+    return DeviceEntry(name=name, type=device_type, driver=driver, label=label)

@@ -29,7 +29,10 @@ def update(store: IdentityStore) -> None:
     downloaded = store.robot_types.resolve()
     local = {name for name, folder in catalogue.TYPES.folders().items() if folder.parent != downloaded}
     catalogue.add_search_path(store.robot_types)
-    missing = sorted({entry.type for entry in config.devices if not entry.room} - local)
+    types_of_robots = {
+        entry.type for entry in config.devices if not (entry.room or catalogue.is_device_type(entry.type))
+    }
+    missing = sorted(types_of_robots - local)
     if pairing is None or not missing:
         return
     types = RobotTypeStore(store.robot_types, agent=pairing.agent, keys=pairing.public_keys())

@@ -1,10 +1,12 @@
-"""Finds the folders of robot types and rooms, and resolves device entries of ``agent.toml`` against them."""
+"""Finds the folders of robot types, device types and rooms, and resolves device entries of ``agent.toml``."""
 
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
+
+from msgspec.structs import replace
 
 from device_agent.config.agent_config import AgentConfig, DeviceEntry
 from device_agent.config.errors import ConfigError
@@ -75,6 +77,7 @@ class Catalogue(Generic[Manifest]):
 
 
 TYPES = Catalogue(label="robot type", pattern=f"*/{robot_type.MANIFEST}", read=robot_type.load)
+DEVICES = Catalogue(label="device type", pattern=f"devices/*/{room.DEVICE_MANIFEST}", read=room.load_device)
 ROOMS = Catalogue(label="room", pattern=f"rooms/*/{room.MANIFEST}", read=room.load)
 
 
@@ -92,13 +95,14 @@ def add_search_path(folder: Path) -> None:
 
 
 def type_of(entry: DeviceEntry) -> robot_type.RobotType:
-    """The robot type of a device entry; for a room device, derived from the room's manifest.
+    """The robot type of a device entry; for a room device, derived from the manifest of its room or device type.
 
     Raises:
         ConfigError: The type or room is unknown, or the room has no device of this name and type.
     """
     if not entry.room:
-        return TYPES.load(entry.type)
+        device = room_device_of(entry)
+        return TYPES.load(entry.type) if device is None else device.robot_type()
     manifest = ROOMS.load(entry.room)
     device, robot = manifest.device(entry.name), manifest.robot(entry.name)
     if device is None and robot is None:
@@ -110,12 +114,31 @@ def type_of(entry: DeviceEntry) -> robot_type.RobotType:
 
 
 def room_device_of(entry: DeviceEntry) -> room.RoomDeviceManifest | None:
-    """The room manifest's part about a device entry, or ``None`` for a robot.
+    """The manifest of a room device, from its room or its device type; ``None`` for a robot.
 
     Raises:
-        ConfigError: The room is unknown.
+        ConfigError: The room is unknown, or a manifest is wrong.
     """
-    return ROOMS.load(entry.room).device(entry.name) if entry.room else None
+    if entry.room:
+        return ROOMS.load(entry.room).device(entry.name)
+    if not is_device_type(entry.type):
+        return None
+    device = DEVICES.load(entry.type)
+    return replace(device, name=entry.name, label=entry.label or device.label, driver=entry.driver or device.driver)
+
+
+def is_device_type(name: str) -> bool:
+    """Whether this type is a device type; a robot type of the same name takes precedence."""
+    return name in DEVICES.folders() and name not in TYPES.folders()
+
+
+def folder_of(entry: DeviceEntry) -> Path:
+    """The folder to which paths in the manifest of a room device are relative.
+
+    Raises:
+        ConfigError: The room or device type is unknown.
+    """
+    return ROOMS.folder(entry.room) if entry.room else DEVICES.folder(entry.type)
 
 
 def entries_of(name: str) -> list[DeviceEntry]:
@@ -144,7 +167,7 @@ def enrolled_devices(configuration: AgentConfig) -> list[dict[str, str]]:
     entries = []
     known = TYPES.folders()
     for device in configuration.devices:
-        if not device.room and device.type not in known:
+        if not (device.room or device.type in known or is_device_type(device.type)):
             label = device.label or device.name
             entries.append({"name": device.name, "kind": "robot", "robot_type": device.type, "label": label})
             continue

@@ -16,6 +16,7 @@ __all__ = ["GROUP", "Factory", "load", "names"]
 
 GROUP = "telescope.sensors"
 _BUILT_IN: Mapping[str, str] = {
+    "mjpeg": "device_agent.sensors.camera.mjpeg",
     "mujoco": "device_agent.sensors.mujoco",
     "perception": "device_agent.sensors.perception",
 }

@@ -1,17 +1,11 @@
 """Pictures from ``CompressedImage`` messages."""
 
-import struct
 from collections.abc import Mapping
 
 from device_agent.drivers.ros.messages import CompressedImage
 from device_agent.ports.driver import DriverError
 from device_agent.ports.sensor import Frame
-
-_START = b"\xff\xd8"
-_MARKER = 0xFF
-_STANDALONE = {0x01, *range(0xD0, 0xDA)}
-_SIZED = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""Markers that start a frame."""
+from device_agent.protocol.camera_frames import jpeg_size
 
 
 class Pictures:
@@ -43,22 +37,3 @@ class Pictures:
         if camera not in self._cameras:
             raise DriverError(f"option 'cameras' names no topic for '{camera}'")
         return self._newest.pop(camera, None)
-
-
-def jpeg_size(data: bytes) -> tuple[int, int]:
-    """Width and height of a JPEG [pixels].
-
-    Raises:
-        ValueError: It is no JPEG.
-    """
-    position = len(_START)
-    while data.startswith(_START) and position + 9 <= len(data) and data[position] == _MARKER:
-        marker = data[position + 1]
-        if marker in _STANDALONE:
-            position += 2
-            continue
-        length, _, height, width = struct.unpack_from(">HBHH", data, position + 2)
-        if marker in _SIZED:
-            return width, height
-        position += 2 + length
-    raise ValueError("a picture is no JPEG")

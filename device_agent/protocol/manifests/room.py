@@ -13,6 +13,7 @@ from device_agent.protocol.manifests import toml
 from device_agent.protocol.manifests.robot_type import Diagnostic, RobotType, check_diagnostics
 
 MANIFEST = "room.toml"
+DEVICE_MANIFEST = "device.toml"
 MAX_RATE_HZ = 50.0
 """Maximum rate of a stream [Hz]; the limit of telemetry."""
 _PERIOD_MS = 50
@@ -263,6 +264,26 @@ def parse(text: str) -> Room:
     _check_climate(room.climate)
     _check_finite("start", room.start.values())
     return room
+
+
+def load_device(folder: Path) -> RoomDeviceManifest:
+    """Read and check the manifest of a device type's folder: a room device without name, room and place.
+
+    Raises:
+        ProtocolError: The manifest is missing or wrong. The message names file and field.
+    """
+    return toml.load(folder / DEVICE_MANIFEST, parse_device, named="kind")
+
+
+def parse_device(text: str) -> RoomDeviceManifest:
+    """Parse a device type from TOML text; its name is its kind.
+
+    Raises:
+        ProtocolError: The text is not TOML, a field is wrong, or fields contradict each other.
+    """
+    device = toml.convert(text, RoomDeviceManifest)
+    _check_device(device)
+    return device
 
 
 def _check_device(device: RoomDeviceManifest) -> None:
