@@ -19,6 +19,8 @@ _BUILT_IN: Mapping[str, str] = {
     "mjpeg": "device_agent.sensors.camera.mjpeg",
     "mujoco": "device_agent.sensors.mujoco",
     "perception": "device_agent.sensors.perception",
+    "rtsp": "device_agent.sensors.camera.rtsp",
+    "v4l2": "device_agent.sensors.camera.v4l2",
 }
 """Name → module that defines ``create``."""
 

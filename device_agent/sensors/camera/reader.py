@@ -12,6 +12,8 @@ _RETRY_S = (1.0, 30.0)
 """First and maximum pause before the next attempt [s]."""
 _REJECTED_RETRY_S = 60.0
 """Pause after rejected credentials [s]: cameras lock an account after several failures in a row."""
+_ATTEMPT_S = 5.0
+"""An attempt without a frame is ended after this time and ``stale_s`` [s]; a decoder process takes seconds to start."""
 _END_S = 1.0
 
 
@@ -84,7 +86,7 @@ class CameraReader:
         Raises:
             SensorError: There is no fresh frame.
         """
-        if time.monotonic() - self._progress_s > 2 * self._stale_s:
+        if time.monotonic() - self._progress_s > self._stale_s + _ATTEMPT_S:
             self._progress_s = time.monotonic()
             self._source.abort()
         with self._changed:

@@ -15,4 +15,4 @@ def rgb(number: int, width: int = WIDTH, height: int = HEIGHT) -> npt.NDArray[np
 
 
 def jpeg(number: int, width: int = WIDTH, height: int = HEIGHT) -> bytes:
-    return bytes(simplejpeg.encode_jpeg(rgb(number, width, height), quality=90))
+    return bytes(simplejpeg.encode_jpeg(rgb(number, width, height), quality=90, colorsubsampling="420"))
