@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from device_agent.cli import devices, doctor, enroll, load_test, models, new_driver, run
+from device_agent.cli import cameras, devices, doctor, enroll, load_test, models, new_driver, run
 from device_agent.config.errors import ConfigError
 from device_agent.load_generator.options import LoadTestError
 from device_agent.ports.driver import DriverError
@@ -20,7 +20,7 @@ _ERRORS = (
     ConfigError, JournalError, DriverError, GeometryError, TransportError, CloudError, LoadTestError, OSError,
 )  # fmt: skip
 """Errors that are shown in one line."""
-_COMMANDS = (enroll, run, doctor, devices, models, new_driver, load_test)
+_COMMANDS = (enroll, run, doctor, devices, cameras, models, new_driver, load_test)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -23,9 +23,9 @@ class DeviceEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     Attributes:
         name: Name of the device, unique at this agent.
-        type: Robot type.
+        type: Robot type, or device type such as ``camera``.
         room: Room whose manifest lists a robot or device of the same name and type; empty for none.
-        driver: Driver name; empty for the driver of the robot type.
+        driver: Driver name; empty for the driver of the type.
         label: Display name; empty for the label of the robot type.
         options: Options of the driver.
         interlocks: Interlocks of the device.
@@ -38,6 +38,19 @@ class DeviceEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     label: Label = ""
     options: dict[str, Any] = {}
     interlocks: Annotated[tuple[InterlockRule, ...], Meta(max_length=32)] = ()
+
+    def lines(self) -> list[str]:
+        """The lines of this entry in ``agent.toml``."""
+        lines = ["[[devices]]"]
+        lines += [f"{key} = {_toml(getattr(self, key))}" for key in ("name", "type", "driver", "label")]
+        if self.room:
+            lines.append(f"room = {_toml(self.room)}")
+        if self.options:
+            lines.append("[devices.options]")
+            lines += [f"{_toml(key)} = {_toml(value)}" for key, value in self.options.items()]
+        for rule in self.interlocks:
+            lines += ["", "[[devices.interlocks]]", *_table(rule)]
+        return lines
 
 
 class RoomStream(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -143,15 +156,7 @@ class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         for stream in self.room:
             lines += ["", "[[room]]", *_table(stream)]
         for device in self.devices:
-            lines += ["", "[[devices]]"]
-            lines += [f"{key} = {_toml(getattr(device, key))}" for key in ("name", "type", "driver", "label")]
-            if device.room:
-                lines.append(f"room = {_toml(device.room)}")
-            if device.options:
-                lines.append("[devices.options]")
-                lines += [f"{_toml(key)} = {_toml(value)}" for key, value in device.options.items()]
-            for rule in device.interlocks:
-                lines += ["", "[[devices.interlocks]]", *_table(rule)]
+            lines += ["", *device.lines()]
         private_file.write(folder / CONFIG_FILE, ("\n".join(lines) + "\n").encode())
 
     def with_manual_settings(self, previous: "AgentConfig") -> "AgentConfig":

@@ -9,6 +9,7 @@ import contextlib
 import errno
 import fcntl
 import json
+import math
 import os
 import resource
 import struct
@@ -17,7 +18,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 HEADER = struct.Struct("!cdHHI")
@@ -109,8 +109,10 @@ def _rtsp(settings: dict[str, Any]) -> Iterator[Picture]:
         "flags": "low_delay",
     }
     due = _due(float(settings["rate_hz"]))
+    start_s = time.monotonic()
     try:
         with av.open(settings["url"], format="rtsp", options=options, timeout=timeout_s) as container:
+            start_s = math.inf
             if not container.streams.video:
                 raise EndError("no-video")
             stream = container.streams.video[0]
@@ -119,7 +121,9 @@ def _rtsp(settings: dict[str, Any]) -> Iterator[Picture]:
                 if next(due):
                     yield _scaled_jpeg(frame, int(settings["width"]), int(settings["max_bytes"]))
     except av.FFmpegError as error:
-        raise EndError(_ffmpeg_reason(error)) from error
+        # FFmpeg reports a server without any response as invalid data.
+        silent = time.monotonic() - start_s >= _EARLY * timeout_s
+        raise EndError("timeout" if silent else _ffmpeg_reason(error)) from error
 
 
 def _decoded(container: Any, stream: Any) -> Iterator[Any]:
@@ -217,8 +221,11 @@ def _check_capture_device(device: str) -> None:
     """Require a device that captures video; OpenCV does not tell why it cannot open one."""
     capability = bytearray(104)
     try:
-        with Path(device).open("rb+", buffering=0, opener=_open_without_waiting) as file:
-            fcntl.ioctl(file, _QUERY_CAPABILITIES, capability)
+        opened = os.open(device, os.O_RDWR | os.O_NONBLOCK)
+        try:
+            fcntl.ioctl(opened, _QUERY_CAPABILITIES, capability)
+        finally:
+            os.close(opened)
     except OSError as error:
         reasons = {errno.ENOENT: "missing", errno.ENODEV: "missing", errno.EACCES: "denied", errno.EPERM: "denied"}
         raise EndError(reasons.get(error.errno or 0, "no-capture")) from error
@@ -227,10 +234,6 @@ def _check_capture_device(device: str) -> None:
         capabilities = int.from_bytes(capability[_DEVICE_CAPABILITIES], sys.byteorder)
     if not capabilities & _VIDEO_CAPTURE:
         raise EndError("no-capture")
-
-
-def _open_without_waiting(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def encoded(image: Any, max_bytes: int) -> Picture:

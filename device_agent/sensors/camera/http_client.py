@@ -38,9 +38,11 @@ class CameraClient:
     Args:
         timeout_s: Maximum silence of the camera [s].
         tls: Creates the verification of https cameras; called with each connection.
+        basic: Whether basic authentication, which sends the password itself, is allowed.
     """
 
-    def __init__(self, *, timeout_s: float, tls: Callable[[], ssl.SSLContext]) -> None:
+    def __init__(self, *, timeout_s: float, tls: Callable[[], ssl.SSLContext], basic: bool = True) -> None:
+        self._basic = basic
         self._timeout_s = timeout_s
         self._tls = tls
         self._connection: HTTPConnection | None = None
@@ -63,7 +65,9 @@ class CameraClient:
             self.close()
             if status == _UNAUTHORIZED and credentials is not None and not authorization:
                 challenges = headers.get_all("WWW-Authenticate") or []
-                authorization = _authorization(challenges, address, credentials, "GET" if body is None else "POST")
+                authorization = self._authorization(
+                    challenges, address, credentials, method="GET" if body is None else "POST"
+                )
             elif status in _REDIRECTS:
                 address = _redirect(address, headers.get("Location", ""))
                 authorization = ""
@@ -85,6 +89,27 @@ class CameraClient:
         if opened is not None:
             with contextlib.suppress(OSError):
                 opened.shutdown(socket.SHUT_RDWR)
+
+    def _authorization(
+        self, challenges: list[str], address: SplitResult, credentials: Credentials, *, method: str
+    ) -> str:
+        """The header for the strongest supported challenge.
+
+        Raises:
+            SensorError: The camera supports neither digest nor basic authentication.
+        """
+        offered = [(scheme.lower(), rest) for scheme, _, rest in (text.strip().partition(" ") for text in challenges)]
+        digests = [rest for scheme, rest in offered if scheme == "digest"]
+        for challenge in digests:
+            header = _digest(challenge, address, credentials, method)
+            if header is not None:
+                return header
+        # A camera that offers digest never receives the password itself.
+        if self._basic and not digests and any(scheme == "basic" for scheme, _ in offered):
+            return "Basic " + base64.b64encode(f"{credentials.user}:{credentials.password}".encode()).decode()
+        raise SensorError(
+            f"{shown(address)} requires an unsupported kind of authentication; enable digest in the camera"
+        )
 
     def _request(self, address: SplitResult, authorization: str, body: Body | None) -> HTTPResponse:
         host, port = address.hostname or "", address.port
@@ -153,25 +178,7 @@ def _refusal(address: SplitResult, status: int) -> SensorError:
         return RejectedError(f"{where} does not accept user and password; check the device's options")
     if status == _NOT_FOUND:
         return SensorError(f"{where} has no such path; check option 'url'")
-    return SensorError(f"{where} responds with status {status}; check the camera and option 'url'")
-
-
-def _authorization(challenges: list[str], address: SplitResult, credentials: Credentials, method: str) -> str:
-    """The header for the strongest supported challenge.
-
-    Raises:
-        SensorError: The camera supports neither digest nor basic authentication.
-    """
-    offered = [(scheme.lower(), rest) for scheme, _, rest in (text.strip().partition(" ") for text in challenges)]
-    digests = [rest for scheme, rest in offered if scheme == "digest"]
-    for challenge in digests:
-        header = _digest(challenge, address, credentials, method)
-        if header is not None:
-            return header
-    # A camera that offers digest never receives the password itself.
-    if not digests and any(scheme == "basic" for scheme, _ in offered):
-        return "Basic " + base64.b64encode(f"{credentials.user}:{credentials.password}".encode()).decode()
-    raise SensorError(f"{shown(address)} requires an unsupported kind of authentication; enable digest in the camera")
+    return SensorError(f"{where} responds with status {status}; check the address, and user and password")
 
 
 def _digest(challenge: str, address: SplitResult, credentials: Credentials, method: str) -> str | None:
