@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from device_agent.ports.sensor import Frame, SensorError
+from device_agent.ports.sensor import Frame, RoomDriver, SensorError
 from device_agent.sensors.camera.driver import CameraDriver
 from tests.harness.network.brokers import wait_until
 
@@ -31,7 +31,7 @@ def failure(driver: CameraDriver) -> str:
     return str(error.value)
 
 
-def wait_for_connection(driver: CameraDriver) -> None:
+def wait_for_connection(driver: RoomDriver) -> None:
     def connects() -> bool:
         try:
             driver.connect()
