@@ -34,7 +34,8 @@ class Viewer:
 
     def receive(self) -> None:
         for message in self._client.pending():
-            device, kind = message.topic.split("/")[4:6]
+            device, _, kind = message.topic.split("/", 4)[4].partition("/")
+            kind = kind.split("/")[0]
             if kind == topics.CAM:
                 self._frames.setdefault(device, []).append(camera_frames.decode(message.payload))
             elif kind == topics.STATE:

@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from device_agent import bootstrap
@@ -89,3 +90,12 @@ def test_a_type_that_the_account_does_not_have_is_an_error(cloud: MemoryCloud, s
     cloud.errors = [CloudError("There is no robot type 'lever'.", "robot-type-unknown")]
     with pytest.raises(ConfigError, match=r"'lever' is not on this machine \(known: .*ur5.*\), and .*: There is no"):
         robot_types.update(store)
+
+
+def test_a_device_type_is_not_downloaded(cloud: MemoryCloud, store: IdentityStore) -> None:
+    config = AgentConfig.load(store.folder)
+    camera = DeviceEntry(name="door", type="camera", driver="mjpeg", options={"url": "http://door/"})
+    msgspec.structs.replace(config, devices=(camera,)).save(store.folder)
+    cloud.errors = [CloudError("There is no robot type 'camera'.", "robot-type-unknown")]
+    robot_types.update(store)
+    assert not cloud.enrolled
