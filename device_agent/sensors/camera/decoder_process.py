@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -36,22 +37,27 @@ class DecoderSource:
     def frames(self) -> Iterator[Frame]:
         """See ``FrameSource``."""
         settings = {**self._settings(), "max_bytes": MAX_JPEG_BYTES}
-        # Libraries print addresses with passwords to the error output.
-        process = subprocess.Popen(  # noqa: S603 (this interpreter and a program of the agent)
-            [*INTERPRETER, str(_PROGRAM)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
+        try:
+            # Libraries print addresses with passwords to the error output.
+            process = subprocess.Popen(  # noqa: S603 (this interpreter and a program of the agent)
+                [*INTERPRETER, str(_PROGRAM)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise SensorError(
+                f"the decoder cannot be started: {error.strerror}; check the memory of the machine"
+            ) from error
         self._process, self._aborted = process, False
         with process, contextlib.ExitStack() as stack:
             stack.callback(process.kill)
             if process.stdin is None or process.stdout is None:
                 raise AssertionError
             with contextlib.suppress(BrokenPipeError):
-                process.stdin.write(json.dumps(settings).encode() + b"\n")
-                process.stdin.flush()
+                # Unbuffered: a rest in the buffer of a process that has ended would fail again in `close`.
+                os.write(process.stdin.fileno(), json.dumps(settings).encode() + b"\n")
             yield from self._received(process.stdout)
 
     def abort(self) -> None:

@@ -10,9 +10,9 @@ from device_agent.config.agent_config import DeviceEntry
 from device_agent.ports.sensor import RoomDriver
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from tests.contract.sensors.suite import RoomDriverContract
-from tests.harness.cameras.mjpeg import MjpegCamera
-from tests.harness.cameras.rtsp import RtspCamera
-from tests.harness.cameras.steps import wait_for_connection
+from tests.harness.network.cameras.mjpeg import MjpegCamera
+from tests.harness.network.cameras.rtsp import RtspCamera
+from tests.harness.network.cameras.steps import wait_for_connection
 
 CAMERAS = {"mjpeg": MjpegCamera, "rtsp": RtspCamera}
 

@@ -14,11 +14,11 @@ from device_agent.config.agent_config import AgentConfig
 from device_agent.protocol import camera_frames, topics
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.state import State
-from tests.harness.cameras.mjpeg import PASSWORD, USER, MjpegCamera
-from tests.harness.cameras.pictures import HEIGHT, WIDTH
-from tests.harness.cameras.rtsp import RtspCamera
 from tests.harness.cloud.cloud_processes import CloudProcesses
 from tests.harness.network.brokers import BrokerKind, Client, wait_until
+from tests.harness.network.cameras.mjpeg import PASSWORD, USER, MjpegCamera
+from tests.harness.network.cameras.pictures import HEIGHT, WIDTH
+from tests.harness.network.cameras.rtsp import RtspCamera
 from tests.harness.paths import ROOT
 
 _END_S = 120.0
@@ -44,6 +44,10 @@ class Viewer:
     def frames(self, device: str) -> list[CameraFrame]:
         self.receive()
         return self._frames.get(device, [])
+
+    def wait_for_frames(self, device: str, count: int) -> list[CameraFrame]:
+        wait_until(lambda: len(self.frames(device)) >= count, f"pictures of {device}")
+        return self.frames(device)
 
     def faults(self, device: str) -> str:
         self.receive()
@@ -105,8 +109,7 @@ def test_a_viewer_receives_pictures_and_the_fault_of_a_frozen_camera(
         try:
             viewer = Viewer(processes.viewer(claimed["agent"]))
             for device in ids:
-                wait_until(lambda device=device: len(viewer.frames(device)) >= 3, f"pictures of {device}")
-                frames = viewer.frames(device)
+                frames = viewer.wait_for_frames(device, 3)
                 assert [frame.sequence for frame in frames] == sorted({frame.sequence for frame in frames})
                 assert [frame.tick_ms for frame in frames] == sorted({frame.tick_ms for frame in frames})
                 assert simplejpeg.decode_jpeg(frames[-1].jpeg).shape == (HEIGHT, WIDTH, 3)
@@ -121,8 +124,7 @@ def test_a_viewer_receives_pictures_and_the_fault_of_a_frozen_camera(
             wait_until(lambda: "no new picture" in viewer.faults("mjpeg"), "the fault of the frozen camera")
             viewer.frames("mjpeg").clear()
             assert not viewer.faults("rtsp"), "the other camera is not affected"
-            shown = len(viewer.frames("rtsp"))
-            wait_until(lambda: len(viewer.frames("rtsp")) >= shown + 3, "pictures of the other camera")
+            viewer.wait_for_frames("rtsp", len(viewer.frames("rtsp")) + 3)
             assert viewer.frames("mjpeg") == [], "a frozen picture is not shown"
             mjpeg.frozen.clear()
             wait_until(lambda: viewer.frames("mjpeg") and not viewer.faults("mjpeg"), "the recovered camera")

@@ -8,8 +8,8 @@ import pytest
 from device_agent import bootstrap
 from device_agent.config.agent_config import DeviceEntry
 from device_agent.sensors.camera.driver import CameraDriver
-from tests.harness.cameras.mjpeg import MjpegCamera
-from tests.harness.cameras.steps import CreateDriver
+from tests.harness.network.cameras.mjpeg import MjpegCamera
+from tests.harness.network.cameras.steps import CreateDriver
 
 
 @pytest.fixture

@@ -13,10 +13,10 @@ import simplejpeg
 
 from device_agent.ports.sensor import SensorError
 from infra.tls import server_ca
-from tests.harness.cameras.mjpeg import PASSWORD, USER, MjpegCamera
-from tests.harness.cameras.pictures import HEIGHT, WIDTH
-from tests.harness.cameras.steps import CreateDriver, failure, next_frame, wait_for_connection
 from tests.harness.network.brokers import wait_until
+from tests.harness.network.cameras.mjpeg import PASSWORD, USER, MjpegCamera
+from tests.harness.network.cameras.pictures import HEIGHT, WIDTH
+from tests.harness.network.cameras.steps import CreateDriver, failure, next_frame, wait_for_connection
 
 _SOCKET_BUFFERS = 16 * 1024 * 1024
 """More than the operating system buffers between two sockets of this machine."""

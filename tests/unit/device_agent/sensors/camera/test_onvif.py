@@ -12,7 +12,7 @@ from device_agent import bootstrap
 from device_agent.__main__ import main
 from device_agent.config.agent_config import DeviceEntry
 from device_agent.sensors.camera.onvif import discovery
-from tests.harness.cameras.onvif import PASSWORD, USER, OnvifCamera
+from tests.harness.network.cameras.onvif import PASSWORD, USER, OnvifCamera
 
 _WAIT_S = "0.6"
 _GROUP = "239.255.255.250"

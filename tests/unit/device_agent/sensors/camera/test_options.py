@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from device_agent.config.errors import ConfigError
-from tests.harness.cameras.steps import CreateDriver
+from tests.harness.network.cameras.steps import CreateDriver
 
 
 @pytest.mark.parametrize(

@@ -16,11 +16,11 @@ import simplejpeg
 
 from device_agent.ports.sensor import SensorError
 from device_agent.sensors.camera import decoder, decoder_process
-from tests.harness.cameras import rtp
-from tests.harness.cameras.pictures import HEIGHT, WIDTH
-from tests.harness.cameras.rtsp import PASSWORD, USER, RtspCamera
-from tests.harness.cameras.steps import CreateDriver, failure, next_frame, wait_for_connection
 from tests.harness.network.brokers import wait_until
+from tests.harness.network.cameras import rtp
+from tests.harness.network.cameras.pictures import HEIGHT, WIDTH
+from tests.harness.network.cameras.rtsp import PASSWORD, USER, RtspCamera
+from tests.harness.network.cameras.steps import CreateDriver, failure, next_frame, wait_for_connection
 
 pytestmark = pytest.mark.slow
 
@@ -97,8 +97,13 @@ def test_no_message_log_or_process_list_contains_the_password(
     arguments = [Path(f"/proc/{child}/cmdline").read_bytes() for child in decoders()]
     assert all(b"hidden" not in line for line in arguments)
     rtsp.muted.clear()
-    messages = [failure(driver)]
-    wait_until(lambda: messages.append(failure(driver)) or "user and password" in messages[-1], "the rejection")
+    messages: list[str] = []
+
+    def rejected() -> bool:
+        messages.append(failure(driver))
+        return "user and password" in messages[-1]
+
+    wait_until(rejected, "the rejection")
     assert "hidden" not in "".join((*messages, caplog.text, *capfd.readouterr()))
 
 

@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import av
 
-from tests.harness.cameras.pictures import HEIGHT, WIDTH, jpeg, rgb
+from tests.harness.network.cameras.pictures import HEIGHT, WIDTH, jpeg, rgb
 
 H264, JPEG = 96, 26
 """Payload types; JPEG has a fixed one."""

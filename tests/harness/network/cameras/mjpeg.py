@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-from tests.harness.cameras.pictures import jpeg
+from tests.harness.network.cameras.pictures import jpeg
 
 USER, PASSWORD, REALM, NONCE = "viewer", "se/cret@1", "camera", "5f2b8c"  # pragma: allowlist secret
 PERIOD_S = 0.02
@@ -238,7 +238,7 @@ def _digest_is_valid(authorization: str, method: str) -> bool:
     first = _md5(f"{USER}:{REALM}:{PASSWORD}")
     second = _md5(f"{method}:{fields['uri']}")
     expected = _md5(f"{first}:{NONCE}:{fields['nc']}:{fields['cnonce']}:{fields['qop']}:{second}")
-    return fields["username"] == USER and fields["response"] == expected
+    return (fields["username"], fields["response"]) == (USER, expected)
 
 
 def _md5(text: str) -> str:

@@ -9,7 +9,7 @@ import socketserver
 import struct
 import threading
 
-from tests.harness.cameras import rtp
+from tests.harness.network.cameras import rtp
 
 USER, PASSWORD, REALM, NONCE = "viewer", "se/cret@1:x", "rtsp camera", "ab34cd"  # pragma: allowlist secret
 PERIOD_S = 0.04
