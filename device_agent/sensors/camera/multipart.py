@@ -52,6 +52,8 @@ class MultipartParser:
         self._buffer += data
         parts = []
         while (part := self._next()) is not None:
+            if len(part) > self._max_bytes:
+                raise self._too_large()
             if part:
                 parts.append(part)
         limit = self._max_bytes + _MAX_HEADER_BYTES + len(self._delimiter)
@@ -100,8 +102,6 @@ class MultipartParser:
                 digits = value.strip()
                 if not digits.isdigit() or len(digits) > 12:  # noqa: PLR2004 (more digits are no size of a picture)
                     raise MultipartError("a part has an invalid length")
-                if int(digits) > self._max_bytes:
-                    raise self._too_large()
                 return int(digits) or None
         return None
 
@@ -118,6 +118,7 @@ class MultipartParser:
         return position
 
     def _too_large(self) -> MultipartError:
+        size_kb = self._max_bytes // 1000
         return MultipartError(
-            f"a picture has more than {self._max_bytes // 1000} KB; choose a lower resolution or quality in the camera"
+            f"a picture has more than {size_kb} KB; choose a lower resolution or quality in the camera"
         )

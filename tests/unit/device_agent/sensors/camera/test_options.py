@@ -31,7 +31,14 @@ def test_a_wrong_option_is_named(create: CreateDriver, driver: str, options: dic
     assert message in str(error.value)
 
 
-@pytest.mark.parametrize("url", ["ftp://viewer:hidden@host/live", "http://viewer:hidden@host:port/x", "hidden"])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "ftp://viewer:hidden@host/live",  # pragma: allowlist secret
+        "http://viewer:hidden@host:port/x",  # pragma: allowlist secret
+        "hidden",
+    ],
+)
 def test_a_rejected_address_is_not_repeated_in_the_message(create: CreateDriver, url: str) -> None:
     with pytest.raises(ConfigError) as error:
         create("mjpeg", url=url)
