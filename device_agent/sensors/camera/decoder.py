@@ -1,4 +1,4 @@
-"""Program that decodes a camera and writes JPEGs, in a process of its own. It imports nothing of the agent.
+"""Program that decodes a camera and writes JPEGs, in a process of its own. Of the agent it imports only Landlock.
 
 A library that blocks or crashes on a damaged stream ends only this process. Input: one line of JSON with the settings;
 the end of the input ends the program, so that it does not outlive the agent. Output: messages of ``HEADER``, each
@@ -12,12 +12,14 @@ import json
 import math
 import os
 import resource
+import socket
 import struct
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 HEADER = struct.Struct("!cdHHI")
@@ -57,7 +59,6 @@ def main() -> int:
     """Decode until the stream or the input ends; returns the exit code."""
     output = os.fdopen(os.dup(sys.stdout.fileno()), "wb", buffering=0)
     settings = json.loads(sys.stdin.readline())
-    threading.Thread(target=_end_with_the_input, daemon=True).start()
     os.nice(_NICENESS)
     resource.setrlimit(resource.RLIMIT_AS, (_MAX_MEMORY_BYTES, _MAX_MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a memory dump would contain the password
@@ -73,6 +74,11 @@ def main() -> int:
         reason = "oversized"
     output.write(HEADER.pack(END, time.monotonic(), 0, 0, len(reason)) + reason.encode())
     return 0
+
+
+def _watch_the_input() -> None:
+    """End with the input. Started after ``confine``, which applies to later threads only."""
+    threading.Thread(target=_end_with_the_input, daemon=True).start()
 
 
 def _end_with_the_input() -> None:
@@ -100,6 +106,10 @@ def _rtsp(settings: dict[str, Any]) -> Iterator[Picture]:
     import av  # noqa: PLC0415 (only this source needs it)
 
     av.logging.set_level(None)
+    address, port = _resolved(str(settings["host"]), int(settings["port"]))
+    url = str(settings["url"]).format(host=address)
+    confine(port)
+    _watch_the_input()
     timeout_s = float(settings["timeout_s"])
     options = {
         "rtsp_transport": "tcp",
@@ -111,7 +121,7 @@ def _rtsp(settings: dict[str, Any]) -> Iterator[Picture]:
     due = _due(float(settings["rate_hz"]))
     start_s = time.monotonic()
     try:
-        with av.open(settings["url"], format="rtsp", options=options, timeout=timeout_s) as container:
+        with av.open(url, format="rtsp", options=options, timeout=timeout_s) as container:
             start_s = math.inf
             if not container.streams.video:
                 raise EndError("no-video")
@@ -124,6 +134,31 @@ def _rtsp(settings: dict[str, Any]) -> Iterator[Picture]:
         # FFmpeg reports a server without any response as invalid data.
         silent = time.monotonic() - start_s >= _EARLY * timeout_s
         raise EndError("timeout" if silent else _ffmpeg_reason(error)) from error
+
+
+def _resolved(host: str, port: int) -> tuple[str, int]:
+    """The address of the camera as a part of an URL, and its port; a confined process cannot look names up."""
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    except OSError as error:
+        raise EndError("unreachable") from error
+    address = str(found[0][4][0])
+    return f"[{address}]" if ":" in address else address, port
+
+
+def confine(port: int) -> None:
+    """Deny this process all files except Python's packages, and other ports, where the kernel has Landlock.
+
+    A stream that takes over the library then reads no key of the agent. A redirect reaches no other port. PyAV imports
+    some of its modules when it needs them.
+    """
+    packages = [folder for folder in sys.path if Path(folder).is_dir()]
+    sys.path.append(str(Path(__file__).resolve().parents[3]))
+    from device_agent.sandbox import landlock, privileges  # noqa: PLC0415 (needs the path)
+
+    with contextlib.suppress(OSError):
+        privileges.renounce()
+        landlock.restrict(packages, connect=port)
 
 
 def _decoded(container: Any, stream: Any) -> Iterator[Any]:
@@ -184,6 +219,7 @@ def _ffmpeg_reason(error: Any) -> str:
 
 def _v4l2(settings: dict[str, Any]) -> Iterator[Picture]:
     """Read a camera of this machine; its own JPEGs are decoded and encoded again, which repairs incomplete ones."""
+    _watch_the_input()
     device = str(settings["device"])
     _check_capture_device(device)
     # OpenCV reads it once, when its module is loaded.

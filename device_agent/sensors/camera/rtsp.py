@@ -13,6 +13,8 @@ from device_agent.sensors.camera.decoder_process import DecoderSource
 from device_agent.sensors.camera.driver import CameraDriver
 from device_agent.sensors.camera.options import NetworkCamera, credentials, parse, shown, split_address
 
+_PORT = 554
+
 
 class Options(NetworkCamera, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of the driver ``rtsp``.
@@ -51,10 +53,14 @@ def create(device: RoomDeviceManifest, folder: Path, surroundings: Surroundings)
     def settings() -> Mapping[str, Any]:
         known = credentials(options)
         login = "" if known is None else f"{quote(known.user, safe='')}:{quote(known.password, safe='')}@"
-        host = address.netloc.rpartition("@")[2]
+        port = address.port or _PORT
+        # The decoder looks the host up before it confines itself, and then inserts its address.
+        rest = address._replace(scheme="", netloc="", fragment="").geturl().replace("{", "%7B").replace("}", "%7D")
         return {
             "source": "rtsp",
-            "url": address._replace(netloc=login + host, fragment="").geturl(),
+            "url": f"rtsp://{login}{{host}}:{port}{rest}",
+            "host": address.hostname,
+            "port": port,
             "rate_hz": options.rate_hz,
             "timeout_s": options.stale_s,
             "width": options.width,

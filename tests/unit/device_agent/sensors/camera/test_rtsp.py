@@ -21,6 +21,7 @@ from tests.harness.network.cameras import rtp
 from tests.harness.network.cameras.pictures import HEIGHT, WIDTH
 from tests.harness.network.cameras.rtsp import PASSWORD, USER, RtspCamera
 from tests.harness.network.cameras.steps import CreateDriver, failure, next_frame, wait_for_connection
+from tests.harness.paths import ROOT
 
 pytestmark = pytest.mark.slow
 
@@ -197,7 +198,9 @@ def test_closing_ends_the_decoder(create: CreateDriver, rtsp: RtspCamera) -> Non
 
 
 def test_the_decoder_ends_with_the_agent(rtsp: RtspCamera) -> None:
-    settings = {"source": "rtsp", "url": rtsp.url(), "rate_hz": 5, "timeout_s": 5, "width": 640, "max_bytes": 100_000}
+    host, port = rtsp.server_address[:2]
+    address = {"source": "rtsp", "url": f"rtsp://{{host}}:{port}/live", "host": host, "port": port}
+    settings = {**address, "rate_hz": 5, "timeout_s": 5, "width": 640, "max_bytes": 100_000}
     with subprocess.Popen(
         [sys.executable, "-I", decoder.__file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
@@ -208,6 +211,34 @@ def test_the_decoder_ends_with_the_agent(rtsp: RtspCamera) -> None:
         assert process.stdout.read(decoder.HEADER.size)[:1] == decoder.FRAME
         process.stdin.close()
         assert process.wait(60) == 0
+
+
+def test_a_decoder_that_is_taken_over_reads_no_file_and_reaches_no_other_port(rtsp: RtspCamera) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        ports = [rtsp.server_address[1], other.getsockname()[1]]
+        process = subprocess.run(
+            [sys.executable, "-c", _TAKEN_OVER, *map(str, ports)], capture_output=True, text=True, check=True, cwd=ROOT
+        )
+    assert json.loads(process.stdout) == ["PermissionError", "connected", "PermissionError"]
+
+
+_TAKEN_OVER = """
+import json, pathlib, socket, sys
+from device_agent.sensors.camera import decoder
+own, other = map(int, sys.argv[1:])
+decoder.confine(own)
+outcomes = []
+def attempt(step):
+    try:
+        step()
+        outcomes.append("connected")
+    except OSError as error:
+        outcomes.append(type(error).__name__)
+attempt(lambda: open("/etc/passwd"))
+attempt(lambda: socket.create_connection(("127.0.0.1", own)))
+attempt(lambda: socket.create_connection(("127.0.0.1", other)))
+print(json.dumps(outcomes))
+"""
 
 
 def test_a_camera_that_is_off_is_named(create: CreateDriver) -> None:
