@@ -152,11 +152,11 @@ def confine(port: int) -> None:
     A stream that takes over the library then reads no key of the agent. A redirect reaches no other port. PyAV imports
     some of its modules when it needs them.
     """
-    packages = [folder for folder in sys.path if Path(folder).is_dir()]
+    packages = [folder for folder in sys.path if folder and Path(folder).is_dir()]
     sys.path.append(str(Path(__file__).resolve().parents[3]))
     from device_agent.sandbox import landlock, privileges  # noqa: PLC0415 (needs the path)
 
-    with contextlib.suppress(OSError):
+    if landlock.abi():
         privileges.renounce()
         landlock.restrict(packages, connect=port)
 
