@@ -21,8 +21,10 @@ class FailingSource:
 
     def frames(self) -> Iterator[Frame]:
         self.attempts += 1
+        yield from self._fail()
+
+    def _fail(self) -> tuple[Frame, ...]:
         raise self._error("it fails")
-        yield
 
     def abort(self) -> None:
         pass
