@@ -20,6 +20,7 @@ from device_agent.sensors.camera.options import (
     shown,
     split_address,
     tls_context,
+    with_files,
 )
 
 _CHUNK_BYTES = 64 * 1024
@@ -29,7 +30,8 @@ class Options(NetworkCamera, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Options of the driver ``mjpeg``.
 
     Attributes:
-        ca: File with the certificate of the camera or of its authority (PEM); empty: the authorities of the system.
+        ca: File with the certificate of the camera or of its authority (PEM), relative to the agent's folder; empty: the
+            authorities of the system.
     """
 
     ca: str = ""
@@ -110,5 +112,5 @@ def create(device: RoomDeviceManifest, folder: Path, surroundings: Surroundings)
     Raises:
         SensorError: An option is unknown, missing or wrong.
     """
-    options = parse(device.options, Options, driver="mjpeg", device=device.name)
+    options = with_files(parse(device.options, Options, driver="mjpeg", device=device.name), folder)
     return CameraDriver(device, MjpegSource(options), options)

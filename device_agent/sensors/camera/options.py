@@ -9,6 +9,7 @@ from urllib.parse import SplitResult, unquote, urlsplit
 
 import msgspec
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from device_agent.ports.sensor import SensorError
 
@@ -37,7 +38,7 @@ class NetworkCamera(Timing, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     Attributes:
         url: Address of the stream. It may contain user and password; a file keeps the password out of ``agent.toml``.
         user: User name; empty: that of ``url``, or none.
-        password_file: Path of a file that contains only the password.
+        password_file: Path of a file that contains only the password; relative to the agent's folder.
         password_env: Environment variable that contains the password.
     """
 
@@ -45,6 +46,9 @@ class NetworkCamera(Timing, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     user: str = ""
     password_file: str = ""
     password_env: str = ""
+
+
+Camera = TypeVar("Camera", bound=NetworkCamera)
 
 
 class Credentials(NamedTuple):
@@ -68,6 +72,12 @@ def parse(options: Mapping[str, Any], kind: type[Options], *, driver: str, devic
         return msgspec.convert(options, kind, strict=False)
     except msgspec.ValidationError as error:
         raise SensorError(f"options of '{device}': {error}") from error
+
+
+def with_files(camera: Camera, folder: Path) -> Camera:
+    """The options with the paths of their files, which are relative to ``folder``."""
+    files = {name: getattr(camera, name) for name in ("password_file", "ca") if getattr(camera, name, "")}
+    return replace(camera, **{name: str(folder / path) for name, path in files.items()})
 
 
 def split_address(url: str, schemes: tuple[str, ...]) -> SplitResult:

@@ -11,7 +11,7 @@ from device_agent.ports.sensor import RoomDriver, Surroundings
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.camera.decoder_process import DecoderSource
 from device_agent.sensors.camera.driver import CameraDriver
-from device_agent.sensors.camera.options import NetworkCamera, credentials, parse, shown, split_address
+from device_agent.sensors.camera.options import NetworkCamera, credentials, parse, shown, split_address, with_files
 
 _PORT = 554
 
@@ -47,7 +47,7 @@ def create(device: RoomDeviceManifest, folder: Path, surroundings: Surroundings)
     Raises:
         SensorError: An option is unknown, missing or wrong.
     """
-    options = parse(device.options, Options, driver="rtsp", device=device.name)
+    options = with_files(parse(device.options, Options, driver="rtsp", device=device.name), folder)
     address = split_address(options.url, ("rtsp",))
 
     def settings() -> Mapping[str, Any]:

@@ -1,6 +1,7 @@
 """Cameras over HTTP and RTSP keep the contract of every room driver."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -12,7 +13,7 @@ from device_agent.protocol.manifests.room import RoomDeviceManifest
 from tests.contract.sensors.suite import RoomDriverContract
 from tests.harness.network.cameras.mjpeg import MjpegCamera
 from tests.harness.network.cameras.rtsp import RtspCamera
-from tests.harness.network.cameras.steps import wait_for_connection
+from tests.harness.network.cameras.steps import entry, wait_for_connection
 
 CAMERAS = {"mjpeg": MjpegCamera, "rtsp": RtspCamera}
 
@@ -27,7 +28,7 @@ class TestCameras(RoomDriverContract):
 
     @pytest.fixture
     def device(self, name: str, camera: MjpegCamera | RtspCamera) -> DeviceEntry:
-        return DeviceEntry(name="door", type="camera", driver=name, options={"url": camera.url(), "stale_s": 60.0})
+        return entry(name, url=camera.url(), stale_s=60.0)
 
     @pytest.fixture
     def entry(self, device: DeviceEntry) -> RoomDeviceManifest:
@@ -36,8 +37,8 @@ class TestCameras(RoomDriverContract):
         return found
 
     @pytest.fixture
-    def driver(self, device: DeviceEntry) -> Iterator[RoomDriver]:
-        created = bootstrap.create_room_device(device, {})
+    def driver(self, device: DeviceEntry, tmp_path: Path) -> Iterator[RoomDriver]:
+        created = bootstrap.create_room_device(device, {}, home=tmp_path)
         assert created is not None
         yield created.driver
         created.close()

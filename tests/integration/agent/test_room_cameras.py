@@ -16,6 +16,7 @@ from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.state import State
 from tests.harness.cloud.cloud_processes import CloudProcesses
 from tests.harness.network.brokers import BrokerKind, Client, wait_until
+from tests.harness.network.cameras import steps
 from tests.harness.network.cameras.mjpeg import PASSWORD, USER, MjpegCamera
 from tests.harness.network.cameras.pictures import HEIGHT, WIDTH
 from tests.harness.network.cameras.rtsp import RtspCamera
@@ -82,16 +83,12 @@ def agent(command: str, home: Path, *arguments: str, **options: Any) -> "subproc
 
 
 def enroll(processes: CloudProcesses, home: Path, cameras: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Enroll with the command line, complete ``agent.toml`` by hand, and claim the agent."""
-    devices = [word for name in cameras for word in ("--device", f"{name}=camera:{name}")]
-    with agent(
-        "enroll", home, "--server", processes.url, "--no-wait", "--no-qr", *devices, stdout=subprocess.PIPE
-    ) as process:
+    """Describe the cameras in ``agent.toml``, enroll with the command line, and claim the agent."""
+    devices = tuple(steps.entry(name, name=name, **options) for name, options in cameras.items())
+    AgentConfig(server=processes.url, name="room", devices=devices).save(home)
+    with agent("enroll", home, "--no-wait", "--no-qr", stdout=subprocess.PIPE) as process:
         output, _ = process.communicate(timeout=_END_S)
     assert process.returncode == 0, output
-    config = AgentConfig.load(home)
-    complete = [msgspec.structs.replace(entry, options=cameras[entry.name]) for entry in config.devices]
-    msgspec.structs.replace(config, devices=tuple(complete)).save(home)
     code = output.split("claim code ")[1].split()[0]
     claimed: dict[str, Any] = processes.anna.post("/agents/claim", {"code": code}).json()
     return claimed

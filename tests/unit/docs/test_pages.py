@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from device_agent import bootstrap as agent_bootstrap
-from device_agent.config.agent_config import AgentConfig, DeviceEntry
+from device_agent.config.agent_config import CONFIG_FILE, AgentConfig
 from device_agent.protocol.events import EventKind
 from function_app import bootstrap, settings
 from function_app.domain.control.control_events import Fact
@@ -176,8 +176,9 @@ def test_the_navigation_of_the_site_lists_every_page() -> None:
     assert pages - decisions == listed - {"reference/messages.md", "reference/openapi.md"}
 
 
-def test_the_drivers_accept_the_options_of_the_camera_guide() -> None:
-    (text,) = [each.text for each in blocks(DOCS / "guides" / "room-cameras.md") if each.language == "toml"]
-    entries = msgspec.convert(tomllib.loads(text)["devices"], list[DeviceEntry])
-    devices = [agent_bootstrap.create_room_device(entry, {}) for entry in entries]
+def test_the_agent_accepts_the_entries_of_the_camera_guide(tmp_path: Path) -> None:
+    text = "\n".join(each.text for each in blocks(DOCS / "guides" / "room-cameras.md") if each.language == "toml")
+    (tmp_path / CONFIG_FILE).write_text(text)
+    entries = AgentConfig.load(tmp_path).devices
+    devices = [agent_bootstrap.create_room_device(entry, {}, home=tmp_path) for entry in entries]
     assert [device and device.manifest.driver for device in devices] == ["rtsp", "v4l2"]

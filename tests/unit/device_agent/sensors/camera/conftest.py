@@ -1,25 +1,24 @@
 """Drivers as ``agent.toml`` describes them."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from device_agent import bootstrap
-from device_agent.config.agent_config import DeviceEntry
 from device_agent.sensors.camera.driver import CameraDriver
 from tests.harness.network.cameras.mjpeg import MjpegCamera
-from tests.harness.network.cameras.steps import CreateDriver
+from tests.harness.network.cameras.steps import CreateDriver, entry
 
 
 @pytest.fixture
-def create() -> Iterator[CreateDriver]:
-    """Creates drivers without connecting them."""
+def create(tmp_path: Path) -> Iterator[CreateDriver]:
+    """Creates drivers without connecting them; the agent's folder is ``tmp_path``."""
     created: list[CameraDriver] = []
 
     def driver(name: str, **options: Any) -> CameraDriver:
-        entry = DeviceEntry(name="door", type="camera", driver=name, options=options)
-        device = bootstrap.create_room_device(entry, {})
+        device = bootstrap.create_room_device(entry(name, **options), {}, home=tmp_path)
         assert device is not None
         assert isinstance(device.driver, CameraDriver)
         created.append(device.driver)

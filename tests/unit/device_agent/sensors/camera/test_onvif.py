@@ -5,12 +5,12 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from device_agent import bootstrap
 from device_agent.__main__ import main
-from device_agent.config.agent_config import DeviceEntry
+from device_agent.config.agent_config import CONFIG_FILE, AgentConfig
+from device_agent.protocol.manifests.room import Watch
 from device_agent.sensors.camera.onvif import discovery
 from tests.harness.network.cameras.onvif import PASSWORD, USER, OnvifCamera
 
@@ -45,16 +45,20 @@ def test_a_search_finds_the_cameras_of_the_network() -> None:
 
 
 def test_the_printed_entry_is_accepted_by_the_agent(
-    onvif: OnvifCamera, login: list[str], capsys: pytest.CaptureFixture[str]
+    onvif: OnvifCamera, login: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert cameras(onvif, *login) == 0
     output = capsys.readouterr().out
-    entry = msgspec.convert(tomllib.loads(output[output.index("[[devices]]") :])["devices"][0], DeviceEntry)
+    (tmp_path / CONFIG_FILE).write_text(f'server = "http://s"\nname = "n"\n{output[output.index("[[devices]]") :]}')
+    (entry,) = AgentConfig.load(tmp_path).devices
     assert (entry.name, entry.type, entry.driver, entry.label) == (
         "door-camera-dc-7", "camera", "rtsp", "Door Camera DC-7",
     )  # fmt: skip
     assert entry.options == {"url": "rtsp://127.0.0.1:554/sub&1?a=1&b=2", "user": USER, "password_file": login[-1]}
-    assert bootstrap.create_room_device(entry, {}) is not None
+    device = bootstrap.create_room_device(entry, {}, home=tmp_path)
+    assert device is not None
+    assert (device.cameras, device.manifest.captures) == (("colour",), ("image",))
+    assert device.manifest.watch == (Watch(source="colour", silent_s=10.0, stuck_s=60.0),)
 
 
 def test_the_password_is_sent_only_as_a_digest(onvif: OnvifCamera, login: list[str]) -> None:

@@ -1,11 +1,16 @@
 """Options of cameras in ``agent.toml``."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
+from device_agent import bootstrap
 from device_agent.config.errors import ConfigError
-from tests.harness.network.cameras.steps import CreateDriver
+from device_agent.protocol import Stream
+from tests.harness.network.cameras.mjpeg import PASSWORD, USER, MjpegCamera
+from tests.harness.network.cameras.steps import CreateDriver, entry, failure, next_frame
 
 
 @pytest.mark.parametrize(
@@ -43,3 +48,28 @@ def test_a_rejected_address_is_not_repeated_in_the_message(create: CreateDriver,
     with pytest.raises(ConfigError) as error:
         create("mjpeg", url=url)
     assert "hidden" not in str(error.value)
+
+
+def test_files_are_relative_to_the_folder_of_the_agent(
+    create: CreateDriver, camera: MjpegCamera, tmp_path: Path
+) -> None:
+    camera.authentication = "digest"
+    message = failure(create("mjpeg", url=camera.url(), user=USER, password_file="secret"))
+    assert message == f"password file {tmp_path / 'secret'}: No such file or directory"
+    (tmp_path / "secret").write_text(PASSWORD)
+    driver = create("mjpeg", url=camera.url(), user=USER, password_file="secret")
+    driver.connect()
+    assert next_frame(driver)
+
+
+@pytest.mark.parametrize("name", ["mjpeg", "rtsp"])
+def test_a_description_beside_one_camera_and_its_image_is_rejected(name: str, tmp_path: Path) -> None:
+    stream = Stream(name="air", rate_hz=1.0)
+    camera = entry(name, url=f"{'http' if name == 'mjpeg' else name}://host/")
+    for wrong in (
+        replace(camera, cameras=(), watch=(), streams=(stream,)),
+        replace(camera, streams=(stream,)),
+        replace(camera, captures=("image", "depth")),
+    ):
+        with pytest.raises(ConfigError, match=f"'door': driver '{name}' has one camera in `cameras`"):
+            bootstrap.create_room_device(wrong, {}, home=tmp_path)
