@@ -76,10 +76,8 @@ class DeviceEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         if self.room:
             lines.append(f"room = {_toml(self.room)}")
         if self.described:
-            description = {field: getattr(self, field) for field in _DESCRIPTION}
-            lines += [
-                f"{key} = {_toml(value)}" for key, value in msgspec.to_builtins(description).items() if any(value)
-            ]
+            fields = msgspec.to_builtins({field: getattr(self, field) for field in _DESCRIPTION})
+            lines += [f"{key} = {_toml(value)}" for key, value in fields.items() if any(value)]  # others: the default
         if self.options:
             lines.append("[devices.options]")
             lines += [f"{_toml(key)} = {_toml(value)}" for key, value in self.options.items()]

@@ -29,8 +29,8 @@ class CameraDriver:
     def __init__(self, device: RoomDeviceManifest, source: FrameSource, timing: Timing) -> None:
         if len(device.cameras) != 1 or device.streams or device.controls or set(device.captures) - {"image"}:
             raise SensorError(
-                f"'{device.name}': driver '{device.driver}' has one camera in `cameras`, and `captures` with 'image' only; "
-                "remove other streams, captures and controls"
+                f"'{device.name}': driver '{device.driver}' has one camera in `cameras`, and only 'image' in "
+                "`captures`; remove other streams, captures and controls"
             )
         self._device = device
         self._source = source

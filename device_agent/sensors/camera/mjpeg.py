@@ -30,8 +30,8 @@ class Options(NetworkCamera, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Options of the driver ``mjpeg``.
 
     Attributes:
-        ca: File with the certificate of the camera or of its authority (PEM), relative to the agent's folder; empty: the
-            authorities of the system.
+        ca: File with the certificate of the camera or of its authority (PEM), relative to the agent's folder. Empty:
+            the authorities of the system.
     """
 
     ca: str = ""

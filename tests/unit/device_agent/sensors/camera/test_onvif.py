@@ -55,6 +55,7 @@ def test_the_printed_entry_is_accepted_by_the_agent(
         "door-camera-dc-7", "camera", "rtsp", "Door Camera DC-7",
     )  # fmt: skip
     assert entry.options == {"url": "rtsp://127.0.0.1:554/sub&1?a=1&b=2", "user": USER, "password_file": login[-1]}
+    assert "position_m" not in output, "defaults are left out"
     device = bootstrap.create_room_device(entry, {}, home=tmp_path)
     assert device is not None
     assert (device.cameras, device.manifest.captures) == (("colour",), ("image",))
