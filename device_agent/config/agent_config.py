@@ -69,6 +69,22 @@ class DeviceEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             **{field: getattr(self, field) for field in _DESCRIPTION},
         )
 
+    def lines(self) -> list[str]:
+        """The lines of this entry in ``agent.toml``."""
+        lines = ["[[devices]]"]
+        lines += [f"{key} = {_toml(getattr(self, key))}" for key in ("name", "type", "driver", "label")]
+        if self.room:
+            lines.append(f"room = {_toml(self.room)}")
+        if self.described:
+            fields = msgspec.to_builtins({field: getattr(self, field) for field in _DESCRIPTION})
+            lines += [f"{key} = {_toml(value)}" for key, value in fields.items() if any(value)]  # others: the default
+        if self.options:
+            lines.append("[devices.options]")
+            lines += [f"{_toml(key)} = {_toml(value)}" for key, value in self.options.items()]
+        for rule in self.interlocks:
+            lines += ["", "[[devices.interlocks]]", *_table(rule)]
+        return lines
+
 
 _DESCRIPTION = ("streams", "cameras", "captures", "controls", "diagnostics", "watch", "position_m")
 """Fields of a device entry that describe a room device."""
@@ -177,7 +193,7 @@ class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         for stream in self.room:
             lines += ["", "[[room]]", *_table(stream)]
         for device in self.devices:
-            lines += ["", "[[devices]]", *_device_table(device)]
+            lines += ["", *device.lines()]
         private_file.write(folder / CONFIG_FILE, ("\n".join(lines) + "\n").encode())
 
     def with_manual_settings(self, previous: "AgentConfig") -> "AgentConfig":
@@ -238,21 +254,6 @@ def _check_description(device: DeviceEntry, path: Path) -> None:
 
 def _has_duplicates(names: Sequence[str]) -> bool:
     return len(set(names)) != len(names)
-
-
-def _device_table(device: DeviceEntry) -> list[str]:
-    lines = [f"{key} = {_toml(getattr(device, key))}" for key in ("name", "type", "driver", "label")]
-    if device.room:
-        lines.append(f"room = {_toml(device.room)}")
-    if device.described:
-        description = {field: getattr(device, field) for field in _DESCRIPTION}
-        lines += [f"{key} = {_toml(value)}" for key, value in msgspec.to_builtins(description).items() if value]
-    if device.options:
-        lines.append("[devices.options]")
-        lines += [f"{_toml(key)} = {_toml(value)}" for key, value in device.options.items()]
-    for rule in device.interlocks:
-        lines += ["", "[[devices.interlocks]]", *_table(rule)]
-    return lines
 
 
 def _table(entry: Struct) -> list[str]:

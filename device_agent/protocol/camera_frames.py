@@ -22,6 +22,12 @@ _HEADER = struct.Struct(">2sBBIQHH")
 _MAGIC, _VERSION, _JPEG = b"TS", 1, 1
 HEADER_BYTES = _HEADER.size
 _SEQUENCE_MODULUS = 2**32
+MAX_JPEG_BYTES = MAX_BYTES - HEADER_BYTES
+_START = b"\xff\xd8"
+_MARKER = 0xFF
+_STANDALONE = {0x01, *range(0xD0, 0xDA)}
+_SIZED = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Markers of a JPEG that start a frame."""
 
 
 class CameraFrame(NamedTuple):
@@ -40,8 +46,8 @@ def encode(frame: CameraFrame) -> bytes:
     Raises:
         ProtocolError: The frame exceeds the maximum message size, or a number does not fit the header.
     """
-    if HEADER_BYTES + len(frame.jpeg) > MAX_BYTES:
-        raise ProtocolError(f"the frame has {len(frame.jpeg)} bytes; the limit is {MAX_BYTES - HEADER_BYTES}")
+    if len(frame.jpeg) > MAX_JPEG_BYTES:
+        raise ProtocolError(f"the frame has {len(frame.jpeg)} bytes; the limit is {MAX_JPEG_BYTES}")
     try:
         header = _HEADER.pack(
             _MAGIC, _VERSION, _JPEG, frame.sequence % _SEQUENCE_MODULUS, frame.tick_ms, frame.width, frame.height
@@ -63,3 +69,22 @@ def decode(payload: bytes) -> CameraFrame:
     if (magic, version, kind) != (_MAGIC, _VERSION, _JPEG):
         raise ProtocolError("the header is not that of a camera frame of version 1")
     return CameraFrame(sequence, tick_ms, width, height, payload[HEADER_BYTES:])
+
+
+def jpeg_size(data: bytes) -> tuple[int, int]:
+    """Width and height of a JPEG [pixels].
+
+    Raises:
+        ValueError: It is no JPEG.
+    """
+    position = len(_START)
+    while data.startswith(_START) and position + 9 <= len(data) and data[position] == _MARKER:
+        marker = data[position + 1]
+        if marker in _STANDALONE:
+            position += 2
+            continue
+        length, _, height, width = struct.unpack_from(">HBHH", data, position + 2)
+        if marker in _SIZED:
+            return width, height
+        position += 2 + length
+    raise ValueError("a picture is no JPEG")

@@ -1,4 +1,4 @@
-"""Landlock: denies this process all files, TCP ports and signals to other processes, except reading named folders.
+"""Landlock: denies this thread all files, TCP ports and signals to other processes, except what is named.
 
 Everything that the kernel's Landlock version can restrict is denied. Numbers are those of ``linux/landlock.h``; the
 system calls have the same number on all architectures.
@@ -11,11 +11,11 @@ from collections.abc import Sequence
 
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
 _GET_VERSION = 1
-_BENEATH_A_FOLDER = 1
+_BENEATH_A_FOLDER, _PORT = 1, 2
 _READ_FILE, _READ_FOLDER = 2**2, 2**3
 _FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 5: 16}
 """ABI version → number of file rights; each is one bit, without gaps."""
-_TCP_RIGHTS, _TCP_SINCE = 0b11, 4
+_TCP_RIGHTS, _CONNECT, _TCP_SINCE = 0b11, 0b10, 4
 _SCOPES, _SCOPES_SINCE = 0b11, 6
 """Scopes: no abstract sockets of, and no signals to, processes outside."""
 
@@ -28,11 +28,12 @@ def abi() -> int:
     return max(0, int(_kernel.syscall(_CREATE_RULESET, None, 0, _GET_VERSION)))
 
 
-def restrict(readable: Sequence[str] = ()) -> None:
-    """Apply the restrictions. Requires ``no_new_privs``.
+def restrict(readable: Sequence[str] = (), *, connect: int | None = None) -> None:
+    """Apply the restrictions to this thread and its later threads. Requires ``no_new_privs``.
 
     Args:
         readable: Folders whose content can be read.
+        connect: TCP port to which connections can be opened; ``None`` for no port.
 
     Raises:
         OSError: The kernel cannot apply them.
@@ -53,6 +54,8 @@ def restrict(readable: Sequence[str] = ()) -> None:
     try:
         for folder in readable:
             _allow_reading(ruleset, folder)
+        if connect is not None and version >= _TCP_SINCE:
+            _add_rule(ruleset, _PORT, _CONNECT.to_bytes(8, sys.byteorder) + connect.to_bytes(8, sys.byteorder))
         if _kernel.syscall(_RESTRICT_SELF, ruleset, 0) != 0:
             raise OSError(ctypes.get_errno(), "Landlock cannot be applied")
     finally:
@@ -64,7 +67,11 @@ def _allow_reading(ruleset: int, folder: str) -> None:
     try:
         rule = (_READ_FILE | _READ_FOLDER).to_bytes(8, sys.byteorder)
         rule += descriptor.to_bytes(4, sys.byteorder, signed=True)
-        if _kernel.syscall(_ADD_RULE, ruleset, _BENEATH_A_FOLDER, rule, 0) != 0:
-            raise OSError(ctypes.get_errno(), "Landlock cannot be applied")
+        _add_rule(ruleset, _BENEATH_A_FOLDER, rule)
     finally:
         os.close(descriptor)
+
+
+def _add_rule(ruleset: int, kind: int, rule: bytes) -> None:
+    if _kernel.syscall(_ADD_RULE, ruleset, kind, rule, 0) != 0:
+        raise OSError(ctypes.get_errno(), "Landlock cannot be applied")

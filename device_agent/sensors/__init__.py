@@ -16,12 +16,15 @@ __all__ = ["GROUP", "Factory", "load", "names"]
 
 GROUP = "telescope.sensors"
 _BUILT_IN: Mapping[str, str] = {
+    "mjpeg": "device_agent.sensors.camera.mjpeg",
     "modbus": "device_agent.sensors.modbus",
     "mujoco": "device_agent.sensors.mujoco",
     "perception": "device_agent.sensors.perception",
     "ros": "device_agent.sensors.ros",
+    "rtsp": "device_agent.sensors.camera.rtsp",
     "serial": "device_agent.sensors.serial",
     "tasmota": "device_agent.sensors.home_mqtt.tasmota",
+    "v4l2": "device_agent.sensors.camera.v4l2",
     "zigbee2mqtt": "device_agent.sensors.home_mqtt.zigbee2mqtt",
 }
 """Name → module that defines ``create``."""

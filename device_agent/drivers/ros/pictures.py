@@ -7,6 +7,7 @@ from device_agent.middleware.ros.images import RawImage
 from device_agent.middleware.ros.messages import CompressedImage
 from device_agent.ports.driver import DriverError
 from device_agent.ports.sensor import Bytes, Frame
+from device_agent.protocol.camera_frames import jpeg_size
 
 
 class Pictures:
@@ -26,7 +27,7 @@ class Pictures:
         Raises:
             ValueError: It is no JPEG.
         """
-        width, height = images.jpeg_size(message.data)
+        width, height = jpeg_size(message.data)
         self._newest[camera] = Frame(width, height, message.data, at_s), at_s
 
     def accept_raw(self, camera: str, message: RawImage, at_s: float) -> None:

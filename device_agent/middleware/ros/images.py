@@ -1,7 +1,6 @@
 """Pictures from ``sensor_msgs/Image`` and ``CompressedImage``, and JPEGs of limited size."""
 
 import math
-import struct
 from typing import Any
 
 import msgspec
@@ -20,11 +19,6 @@ _QUALITIES = (75, 55, 35)
 _COLOURS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "mono8": (0, 0, 0)}
 _DEPTHS = {"16UC1": "u2", "32FC1": "f4"}
 _MILLIMETRE = 0.001
-_START = b"\xff\xd8"
-_MARKER = 0xFF
-_STANDALONE = {0x01, *range(0xD0, 0xDA)}
-_SIZED = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""Markers that start a frame."""
 
 
 class RawImage(msgspec.Struct, frozen=True):
@@ -100,25 +94,6 @@ def from_jpeg(content: bytes) -> Bytes:
         ValueError: It is damaged.
     """
     return np.asarray(simplejpeg.decode_jpeg(content))
-
-
-def jpeg_size(data: bytes) -> tuple[int, int]:
-    """Width and height of a JPEG [pixels].
-
-    Raises:
-        ValueError: It is no JPEG.
-    """
-    position = len(_START)
-    while data.startswith(_START) and position + 9 <= len(data) and data[position] == _MARKER:
-        marker = data[position + 1]
-        if marker in _STANDALONE:
-            position += 2
-            continue
-        length, _, height, width = struct.unpack_from(">HBHH", data, position + 2)
-        if marker in _SIZED:
-            return width, height
-        position += 2 + length
-    raise ValueError("a picture is no JPEG")
 
 
 def _rows(image: RawImage, kind: str, channels: int) -> Any:

@@ -9,6 +9,7 @@ from device_agent.middleware.ros import images
 from device_agent.middleware.ros.images import RawImage
 from device_agent.middleware.ros.messages import CompressedImage
 from device_agent.ports.sensor import Bytes, Capture, Depths, Frame, Image
+from device_agent.protocol.camera_frames import jpeg_size
 from device_agent.sensors import png
 from device_agent.sensors.ros.base import RosSensor
 
@@ -90,7 +91,7 @@ class CompressedCamera(_Camera):
     def _jpeg(self, message: CompressedImage) -> tuple[int, int, bytes]:
         if len(message.data) > images.MAX_JPEG:
             return images.to_jpeg(images.from_jpeg(message.data))
-        return *images.jpeg_size(message.data), message.data
+        return *jpeg_size(message.data), message.data
 
     def _arrays(self, message: CompressedImage) -> tuple[Bytes | None, Depths | None]:
         return images.from_jpeg(message.data), None

@@ -7,7 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from device_agent.config.agent_config import AgentConfig
+from device_agent import bootstrap as agent_bootstrap
+from device_agent.config.agent_config import CONFIG_FILE, AgentConfig
 from device_agent.protocol.events import EventKind
 from function_app import bootstrap, settings
 from function_app.domain.control.control_events import Fact
@@ -173,3 +174,11 @@ def test_the_navigation_of_the_site_lists_every_page() -> None:
     pages = {str(page.relative_to(DOCS)) for page in PAGES if page.is_relative_to(DOCS)}
     decisions = {page for page in pages if page.startswith("decisions/")}  # added by a hook
     assert pages - decisions == listed - {"reference/messages.md", "reference/openapi.md"}
+
+
+def test_the_agent_accepts_the_entries_of_the_camera_guide(tmp_path: Path) -> None:
+    text = "\n".join(each.text for each in blocks(DOCS / "guides" / "room-cameras.md") if each.language == "toml")
+    (tmp_path / CONFIG_FILE).write_text(text)
+    entries = AgentConfig.load(tmp_path).devices
+    devices = [agent_bootstrap.create_room_device(entry, {}, home=tmp_path) for entry in entries]
+    assert [device and device.manifest.driver for device in devices] == ["rtsp", "v4l2"]

@@ -11,8 +11,8 @@ import simplejpeg
 from device_agent import drivers
 from device_agent.drivers.ros import RosBaseDriver, RosDriver
 from device_agent.drivers.testing.peer import Disturbance
-from device_agent.middleware.ros.images import jpeg_size
 from device_agent.ports.driver import DriverError, Twist, UnreachableError
+from device_agent.protocol.camera_frames import jpeg_size
 from tests.harness.paths import ROBOTS, UR5
 from tests.harness.robots.ros import robot as topics
 from tests.harness.robots.ros.peer import RosPeer

@@ -1,0 +1,1 @@
+"""Emulated cameras on loopback: MJPEG over HTTP, RTSP, and ONVIF."""
