@@ -208,6 +208,11 @@ class Authority:
         if self.suspended:
             raise Refused("restarting", self.suspended)
 
+    def check_goal(self, reservation: Reservation) -> None:
+        """Check that nothing prevents motion, and that this reservation is in force. Raises ``Refused``."""
+        self.check_free()
+        self.check_reservation(reservation)
+
     def check_reservation(self, reservation: Reservation) -> None:
         """Check that this reservation is in force.
 

@@ -194,7 +194,7 @@ class Controller:
             Refused: As ``start_joint_goal``.
         """
         with self._lock:
-            self._check_goal(reservation)
+            self._state.authority.check_goal(reservation)
             return self._state.limits.resolve_target(position_rad, self._state.motion.position_rad)
 
     def start_joint_goal(
@@ -207,7 +207,7 @@ class Controller:
                 out of range, or no clearance there.
         """
         with self._lock:
-            self._check_goal(reservation)
+            self._state.authority.check_goal(reservation)
             self._state.stiffness.check_movable(position_rad)
             return self._state.goals.start_joint_goal(position_rad, speed)
 
@@ -219,7 +219,7 @@ class Controller:
                 it leaves a joint's range.
         """
         with self._lock:
-            self._check_goal(reservation)
+            self._state.authority.check_goal(reservation)
             moved = np.any(trajectory.position_rad != trajectory.position_rad[0], axis=0)
             self._state.stiffness.check_movable(
                 joint.name for joint, moves in zip(self._joints, moved, strict=True) if moves
@@ -233,7 +233,7 @@ class Controller:
             Refused: The reservation has ended, stopped, faulty, or held or slowed by the room.
         """
         with self._lock:
-            self._check_goal(reservation)
+            self._state.authority.check_goal(reservation)
             self._state.hand_over()
 
     def take_over(self) -> None:
@@ -249,7 +249,7 @@ class Controller:
                 limits of the base.
         """
         with self._lock:
-            self._check_goal(reservation)
+            self._state.authority.check_goal(reservation)
             return self._state.goals.start_drive(twist, duration_s)
 
     def stiffness_of(self, joints: Sequence[str]) -> dict[str, float]:
@@ -259,8 +259,7 @@ class Controller:
             Refused: A joint is unknown.
         """
         with self._lock:
-            stiffness = self._state.stiffness
-            return {name: stiffness.values.get(name, 1.0) for name in stiffness.resolve_names(joints)}
+            return self._state.stiffness.of(joints)
 
     def set_stiffness(self, values: Mapping[str, float], *, reservation: Reservation | None = None) -> None:
         """Record the stiffness of joints, 0…1. The caller sets it at the driver.
@@ -270,7 +269,7 @@ class Controller:
         """
         with self._lock:
             if reservation is not None:
-                self._check_goal(reservation)
+                self._state.authority.check_goal(reservation)
             self._state.stiffness.set(values)
 
     def suspend(self, why: str, now_s: float) -> str:
@@ -399,7 +398,3 @@ class Controller:
     def _fence(self, epoch: int) -> None:
         if self._state.authority.fence(epoch):
             self._state.stream.reset(self._state.motion.position_rad)
-
-    def _check_goal(self, reservation: Reservation) -> None:
-        self._state.authority.check_free()
-        self._state.authority.check_reservation(reservation)

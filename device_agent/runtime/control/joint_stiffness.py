@@ -38,6 +38,10 @@ class JointStiffness:
                 raise Refused("unknown_joint", f"no joint '{name[:80]}'; there are {', '.join(self._index)}")
         return tuple(joints) or tuple(self._index)
 
+    def of(self, joints: Sequence[str]) -> dict[str, float]:
+        """Stiffness of these joints, or of all, 0…1. Raises ``Refused`` if a joint is unknown."""
+        return {name: self._values.get(name, 1.0) for name in self.resolve_names(joints)}
+
     def set(self, values: Mapping[str, float]) -> None:
         """Set the stiffness of joints, 0…1."""
         merged = {**self._values, **values}
