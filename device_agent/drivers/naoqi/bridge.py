@@ -2,11 +2,13 @@
 
 It imports nothing of the agent. Its standard input is a socket on which both sides send JSON objects, one a line. The
 first line configures it. ``connection.py`` documents the messages. When the agent's side closes, or no command arrives
-for ``WATCHDOG_S``, it stops the robot.
+for ``WATCHDOG_S``, it stops the robot. When it loses the robot, the program ``examples/nao/telescope_watchdog.py`` on the robot does so; without this program
+the robot does not walk.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -31,6 +33,10 @@ _END_S = 1.0
 _LAG_RAD = 0.1
 """Largest distance of a joint that holds from its command [rad]."""
 _MAX_LINE = 65536
+_BEAT, _ECHO = "Telescope/Beat", "Telescope/Echo"
+"""Data of ``ALMemory``: a number that changes while the connection works, and its repetition by the robot's watchdog."""
+_GUARDED_S = 0.25
+"""The robot is guarded for this time after an echo [s]."""
 _SENSOR = "Device/SubDeviceList/{}/{}/Value"
 _TIME = "DCM/Time"
 _FALLEN = "robotHasFallen"
@@ -62,11 +68,41 @@ class Robot:
         self._move: Any = None
         self._stop: Any = None
         self._stop_is_last = False
+        self._beats = itertools.cycle(range(1, 1 << 30))
+        self._beat: Any = None
+        self._echo: Any = None
+        self._echoed: Any = None
+        self._guarded_s = -math.inf
+        self._ending = False
         call(self.motion.setMoveArmsEnabled, False, False)  # the agent moves the arms, also while the robot walks
 
     def service(self, name: str) -> Any:
         """A proxy of a service."""
         return self.session.service(name, _async=True).value(_CALL_MS)
+
+    @property
+    def guarded(self) -> bool:
+        """Whether the robot stops by itself if the connection to it is lost."""
+        return time.monotonic() - self._guarded_s < _GUARDED_S
+
+    def find_watchdog(self) -> None:
+        """Beat until the first echo, so that the first status is true. Without a watchdog it takes a moment."""
+        end_s = time.monotonic() + _GUARDED_S
+        while not self.guarded and time.monotonic() < end_s:
+            self.beat()
+            time.sleep(_CHECK_S / 4)
+
+    def beat(self) -> None:
+        """Show the robot's watchdog that the connection works, and read its echo."""
+        if self._ending or is_running(self._beat) or is_running(self._echo):
+            return
+        if self._echo is not None and not self._echo.hasError():
+            echo = self._echo.value()
+            if self._echoed not in (None, echo):  # the first one may be that of an earlier connection
+                self._guarded_s = time.monotonic()
+            self._echoed = echo
+        self._beat = self.memory.insertData(_BEAT, next(self._beats), _async=True)
+        self._echo = self.memory.getData(_ECHO, _async=True)
 
     def move_joints(self, angles: list[float | None]) -> None:
         """Move those joints that have an angle."""
@@ -84,7 +120,7 @@ class Robot:
             if self._held:
                 return
             self._walked_s = time.monotonic()
-            if not any(twist):
+            if not any(twist) or not self.guarded:
                 self._stop_walk()
             elif not is_running(self._move):
                 self.walks, self._stop_is_last = True, False
@@ -108,7 +144,8 @@ class Robot:
             self._hold_joints()
 
     def end(self) -> None:
-        """Hold, and wait until the robot has confirmed it."""
+        """Hold, wait until the robot has confirmed it, and release the robot's watchdog."""
+        self._ending = True
         self.hold(for_good=True)
         end_s = time.monotonic() + _END_S
         while (self.walks or is_running(self._angles)) and time.monotonic() < end_s:
@@ -116,6 +153,10 @@ class Robot:
             with self._lock:
                 if self.walks:
                     self._stop_walk()
+        if not self.walks:
+            if self._beat is not None:
+                self._beat.wait(_CALL_MS)
+            self.memory.insertData(_BEAT, 0, _async=True).wait(_CALL_MS)
 
     def angles(self, *, sensors: bool = True) -> list[float]:
         """Measured angles [rad], or those that NAOqi commands now on the way to their targets."""
@@ -144,6 +185,7 @@ class Robot:
             "walks": bool(call(self.motion.moveIsActive)),
             "pose": numbers(call(self.motion.getRobotPosition, True), 3),
             "twist": numbers(call(self.motion.getRobotVelocity), 3),
+            "guarded": self.guarded,
             "battery_percent": numbers([call(self.battery.getBatteryCharge)], 1)[0],
         }
 
@@ -214,6 +256,7 @@ class Bridge:
             self.send({"type": "failure", "message": str(error) or repr(error)})
             return
         robot.hold()
+        robot.find_watchdog()
         for target in (self._measure, self._report, self._watch):
             threading.Thread(target=target, args=(robot,), daemon=True).start()
         try:
@@ -270,6 +313,7 @@ class Bridge:
     def _watch(self, robot: Robot) -> None:
         while True:
             time.sleep(_CHECK_S)
+            robot.beat()
             robot.check()
 
 

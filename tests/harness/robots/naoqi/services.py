@@ -33,6 +33,7 @@ class Body:
         self.fallen, self.fall_manager, self.posture = False, True, "Standing"
         self.spoken, self.calls, self.language = [], [], "English"
         self.speaking = threading.Event()
+        self.memory = {}
         self.disturbance, self.old_ms = "", 0
         self.rest_s: float | None = time.monotonic()
         threading.Thread(target=self.run, daemon=True).start()
@@ -153,7 +154,13 @@ class ALMemory:
             return self.body.old_ms if self.body.disturbance == "clock" else int(time.monotonic() * 1000)
         if key == "robotHasFallen":
             return 1.0 if self.body.fallen else 0.0
+        if key in self.body.memory:
+            return self.body.memory[key]
         raise RuntimeError(f"no data '{key}'")
+
+    def insertData(self, key, value):
+        with self.body.lock:
+            self.body.memory[key] = value
 
     def getListData(self, keys):
         return [float(30 + self.body.joints.index(key.split("/")[2])) for key in keys]
