@@ -65,9 +65,13 @@ class JointCommands:
         self.type = dialect.type(_TYPES[command.kind])
 
     def towards(self, target_rad: Sequence[float], measured: Measurement, now_s: float) -> Publication | None:
-        """The command for a target within the limits, or ``None`` if the previous one was just sent."""
+        """The command for a target within the limits.
+
+        ``None`` if the previous one was just sent, or if measurements are overdue. Commands would then queue in the
+        network, and the robot would make up for them at once.
+        """
         elapsed_s = now_s - self._sent_s
-        if elapsed_s < _EARLY * self._interval_s:
+        if elapsed_s < _EARLY * self._interval_s or now_s > measured.fresh_until_s:
             return None
         if elapsed_s > self._horizon_s:
             self._position, self._since_s, elapsed_s = measured.position_rad, now_s, self._interval_s

@@ -47,12 +47,13 @@ class Bridge:
         self._genpy = genpy
         self._sending = threading.Lock()
         self._publishers: dict[str, Any] = {}
+        self._subscribed: set[str] = set()
         self._driven_s: dict[str, float] = {}
         self._forwarded_s: dict[str, float] = {}
 
     def run(self) -> None:
         """Execute operations until the agent's side closes; then brake."""
-        threading.Thread(target=self._watch_base, daemon=True).start()
+        threading.Thread(target=self._watch, daemon=True).start()
         lines = self._link.makefile("rb")
         for line in iter(lambda: lines.readline(_MAX_LINE), b""):
             try:
@@ -103,10 +104,19 @@ class Bridge:
         except OSError:
             return  # the main thread notices it too
 
-    def _watch_base(self) -> None:
+    def _watch(self) -> None:
         while True:
             time.sleep(_CHECK_S)
             self._brake(newest_s=time.monotonic() - WATCHDOG_S)
+            self._check_subscribers()
+
+    def _check_subscribers(self) -> None:
+        for topic, publisher in list(self._publishers.items()):
+            if publisher.get_num_connections():
+                self._subscribed.add(topic)
+            elif topic in self._subscribed:
+                self.report("error", f"the subscriber of {topic} has disconnected; check the robot's controllers")
+                os._exit(1)
 
     def _brake(self, *, newest_s: float) -> None:
         """Publish zero on each topic whose last velocity is older than this time [s]."""

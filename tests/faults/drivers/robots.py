@@ -1,13 +1,16 @@
 """Robots behind connections that can be cut: the driver, its peer, and a TCP proxy between them."""
 
+import os
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from enum import Enum
 from typing import Any, Protocol
 
 from device_agent import drivers
 from device_agent.drivers.naoqi.driver import NaoqiDriver
+from device_agent.drivers.ros import RosDriver
 from device_agent.ports.driver import Driver, DriverError, MobileDriver, Twist
 from device_agent.ports.threads import SupervisedThread
 from device_agent.protocol.manifests import robot_type as robot_types
@@ -15,11 +18,13 @@ from tests.harness.network.proxy import Proxy
 from tests.harness.paths import NAOQI_PYTHON, ROBOTS, UR5
 from tests.harness.robots.naoqi.peer import NaoPeer
 from tests.harness.robots.ros.peer import RosPeer
+from tests.harness.robots.ros.ros_system import RosRobot, RosSystem
 from tests.harness.robots.universal_robots.peer import UrPeer
 
 ARM = robot_types.load(UR5)
 NAO = robot_types.load(ROBOTS / "nao")
 _FAST_RAD_S = 2.0
+_MAX_RAD_S = max(joint.max_velocity_rad_s for joint in ARM.joints)
 _WALK = Twist(forward_m_s=0.05, turn_rad_s=0.1)
 
 
@@ -40,11 +45,13 @@ class Robot(Protocol):
     Attributes:
         driver: The driver, which is not connected at first.
         cuts: What can happen to its connection.
+        late_rad: How far it may move when its network delivers late [rad, m].
         period_s: Time between two commands [s].
     """
 
     driver: Driver
     cuts: tuple[Cut, ...]
+    late_rad: float
     period_s: float
 
     def far(self) -> list[float]:
@@ -121,6 +128,13 @@ def connect(robot: Robot) -> None:
     until(connects)
 
 
+def far(position_rad: Sequence[float]) -> list[float]:
+    """A target of the arm 1 rad beyond its home position, on the other side of it [rad]."""
+    home = [ARM.home_rad[joint.name] for joint in ARM.joints]
+    sign = -1.0 if position_rad[0] > home[0] else 1.0
+    return [value + sign for value in home]
+
+
 class _BehindProxies:
     """The part that all robots with a proxy have in common."""
 
@@ -159,10 +173,7 @@ class _Arm(_BehindProxies):
     period_s = ARM.period_ms / 1000
 
     def far(self) -> list[float]:
-        position = self.peer.joint_positions()
-        home = [ARM.home_rad[joint.name] for joint in ARM.joints]
-        sign = -1.0 if position[0] > home[0] else 1.0
-        return [value + sign for value in home]
+        return far(self.peer.joint_positions())
 
     def moves(self) -> bool:
         return max(map(abs, self.peer.joint_velocities())) > _FAST_RAD_S
@@ -177,7 +188,9 @@ class _Arm(_BehindProxies):
 
 
 class RtdeArm(_Arm):
-    """A UR5 with its own controller."""
+    """A UR5 with its own controller. Its program ends before it executes what arrives late."""
+
+    late_rad = 5e-3
 
     def __init__(self) -> None:
         self.peer = UrPeer(ARM)
@@ -205,7 +218,9 @@ class RtdeArm(_Arm):
 
 
 class RosbridgeArm(_Arm):
-    """A UR5 with ROS behind rosbridge."""
+    """A UR5 with ROS behind rosbridge. It executes what was sent until measurements were overdue."""
+
+    late_rad = 0.15 * _MAX_RAD_S
 
     def __init__(self) -> None:
         self.peer = RosPeer(ARM)
@@ -234,9 +249,62 @@ class RosbridgeArm(_Arm):
             return self.now_s()
 
 
-class WalkingNao(_BehindProxies):
-    """A NAO that walks and moves its head."""
+class RospyArm:
+    """A UR5 with ROS 1: the robot is a node, and so is the driver's bridge process, which can be stopped."""
 
+    cuts = tuple(Cut)
+    late_rad = RosbridgeArm.late_rad
+    period_s = ARM.period_ms / 1000
+
+    def __init__(self, system: RosSystem) -> None:
+        self._robot = RosRobot(system, ARM)
+        options = {
+            "connection": "rospy",
+            "master": system.uri,
+            "names": {joint.name: f"{joint.name}_joint" for joint in ARM.joints},
+            "command": {"topic": "/arm_controller/command"},
+        }
+        driver = drivers.load("ros")(ARM, UR5, options, "arm")
+        assert isinstance(driver, RosDriver)
+        self.driver: RosDriver = driver
+        self._stopped: int | None = None
+
+    def far(self) -> list[float]:
+        return far(self._robot.positions())
+
+    def moves(self) -> bool:
+        return max(map(abs, self._robot.state()["velocity"].values())) > _FAST_RAD_S
+
+    def now_s(self) -> float:
+        return float(self._robot.state()["time_s"])
+
+    def moved_s(self) -> float:
+        return float(self._robot.state()["moved_s"])
+
+    def place(self) -> list[float]:
+        return self._robot.positions()
+
+    def cut(self, cut: Cut) -> float:
+        if cut is Cut.CLOSED:
+            return float(self._robot.state("cut")["cut_s"])
+        assert self.driver._connection is not None
+        self._stopped = self.driver._connection._channel.process.pid  # type: ignore[attr-defined]
+        os.kill(self._stopped, signal.SIGSTOP)
+        return self.now_s()
+
+    def restore(self, cut: Cut) -> None:
+        if cut is Cut.LATE and self._stopped is not None:
+            os.kill(self._stopped, signal.SIGCONT)
+
+    def close(self) -> None:
+        self.driver.close()
+        self._robot.kill()
+
+
+class WalkingNao(_BehindProxies):
+    """A NAO that walks and moves its head. At most one command of each kind is in its network."""
+
+    late_rad = 0.1
     period_s = NAO.period_ms / 1000
 
     def __init__(self) -> None:

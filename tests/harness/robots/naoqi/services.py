@@ -254,6 +254,7 @@ class Nao:
                 "target",
                 "velocity",
                 "twist",
+                "pose",
                 "rest_s",
                 "stiffness",
                 "fraction",

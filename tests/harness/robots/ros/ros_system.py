@@ -106,11 +106,11 @@ class RosRobot:
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == "ready\n"
 
-    def state(self) -> dict[str, Any]:
-        """The true state."""
+    def state(self, request: str = "") -> dict[str, Any]:
+        """The true state, after an optional request."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
-        self.process.stdin.write("\n")
+        self.process.stdin.write(f"{request}\n")
         self.process.stdin.flush()
         state: dict[str, Any] = json.loads(self.process.stdout.readline())
         return state

@@ -2,10 +2,13 @@
 
 Its controllers are those of the emulated robot (the file ``CONTROLLERS``). Standard input takes a line for each state
 that it prints: positions and velocities by joint, the commanded and the true speed of the base, and times in seconds.
+The line ``cut`` first closes the TCP connections of all topics.
 """
 
+import contextlib
 import importlib.machinery
 import json
+import socket
 import sys
 import threading
 import time
@@ -23,13 +26,16 @@ def main():
     home = {name: float(value) for name, _, value in (each.partition("=") for each in sys.argv[2:])}
     robot = Robot(controllers, home)
     rospy.init_node("robot", disable_signals=True)
-    rospy.Subscriber("/arm_controller/command", JointTrajectory, robot.follow, queue_size=1, tcp_nodelay=True)
-    rospy.Subscriber("/cmd_vel", Twist, robot.drive, queue_size=1, tcp_nodelay=True)
+    command = rospy.Subscriber("/arm_controller/command", JointTrajectory, robot.follow, queue_size=1, tcp_nodelay=True)
+    velocity = rospy.Subscriber("/cmd_vel", Twist, robot.drive, queue_size=1, tcp_nodelay=True)
+    robot.topics += [command, velocity]
     stop = rospy.Publisher("/emergency_stop", Bool, queue_size=1, latch=True)
     stop.publish(Bool(False))
     threading.Thread(target=robot.run, daemon=True).start()
     print("ready", flush=True)
-    for _ in sys.stdin:
+    for line in sys.stdin:
+        if line == "cut\n":
+            robot.cut()
         print(json.dumps(robot.state()), flush=True)
 
 
@@ -40,10 +46,19 @@ class Robot:
         self._rejected = controllers.RejectedError
         self._cycle_s = controllers.CYCLE_S
         self._lock = threading.Lock()
-        self._command_s = self._rest_s = 0.0
+        self._command_s = self._rest_s = self._cut_s = 0.0
         self._commands = 0
         self._states = rospy.Publisher("/joint_states", JointState, queue_size=1, tcp_nodelay=True)
         self._odometry = rospy.Publisher("/odom", Odometry, queue_size=1)
+        self.topics = [self._states, self._odometry]
+
+    def cut(self):
+        with self._lock:
+            for topic in self.topics:
+                for connection in list(topic.impl.connections):
+                    with contextlib.suppress(OSError, AttributeError):  # it has ended already
+                        connection.socket.shutdown(socket.SHUT_RDWR)
+            self._cut_s = self.joints.time_s
 
     def follow(self, message):
         points = [
@@ -98,6 +113,7 @@ class Robot:
                 "time_s": self.joints.time_s,
                 "command_s": self._command_s,
                 "moved_s": self._rest_s,
+                "cut_s": self._cut_s,
             }
 
 
