@@ -2,8 +2,8 @@
 
 It imports nothing of the agent. Its standard input is a socket on which both sides send JSON objects, one a line. The
 first line configures it. ``connection.py`` documents the messages. When the agent's side closes, or no command arrives
-for ``WATCHDOG_S``, it stops the robot. When it loses the robot, the program ``examples/nao/telescope_watchdog.py`` on the robot does so; without this program
-the robot does not walk.
+for ``WATCHDOG_S``, it stops the robot. When it loses the robot, ``examples/nao/telescope_watchdog.py`` on the robot
+does so; without this program the robot does not walk.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LAG_RAD = 0.1
 """Largest distance of a joint that holds from its command [rad]."""
 _MAX_LINE = 65536
 _BEAT, _ECHO = "Telescope/Beat", "Telescope/Echo"
-"""Data of ``ALMemory``: a number that changes while the connection works, and its repetition by the robot's watchdog."""
+"""Data of ``ALMemory``: a number that changes while the connection works, and its repetition by the watchdog."""
 _GUARDED_S = 0.25
 """The robot is guarded for this time after an echo [s]."""
 _SENSOR = "Device/SubDeviceList/{}/{}/Value"

@@ -21,6 +21,8 @@ _MARGIN = 1.1
 """Highest speed of the commands as a multiple of the agent's limit, so that they catch up with a late period."""
 _EARLY = 0.75
 """A command may be sent after this share of the interval, because periods are not exact."""
+_LATE = 2.0
+"""Longest interval for which one command makes up, in intervals. The robot brakes meanwhile, and starts again."""
 _TYPES = {
     "trajectory": "trajectory_msgs/JointTrajectory",
     "positions": "std_msgs/Float64MultiArray",
@@ -75,6 +77,7 @@ class JointCommands:
             return None
         if elapsed_s > self._horizon_s:
             self._position, self._since_s, elapsed_s = measured.position_rad, now_s, self._interval_s
+        elapsed_s = min(elapsed_s, _LATE * self._interval_s)
         running_s = now_s - self._since_s + self._interval_s
         self._position = tuple(
             position + min(max(target - position, -step), step)

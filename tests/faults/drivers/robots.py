@@ -43,16 +43,18 @@ class Robot(Protocol):
     """A robot, seen at its peer. Times are those of the peer's clock [s].
 
     Attributes:
-        driver: The driver, which is not connected at first.
         cuts: What can happen to its connection.
         late_rad: How far it may move when its network delivers late [rad, m].
         period_s: Time between two commands [s].
     """
 
-    driver: Driver
     cuts: tuple[Cut, ...]
     late_rad: float
     period_s: float
+
+    @property
+    def driver(self) -> Driver:
+        """The driver, which is not connected at first."""
 
     def far(self) -> list[float]:
         """A target that takes more than a second, shape (n,) [rad]."""
@@ -176,7 +178,7 @@ class _Arm(_BehindProxies):
         return far(self.peer.joint_positions())
 
     def moves(self) -> bool:
-        return max(map(abs, self.peer.joint_velocities())) > _FAST_RAD_S
+        return bool(max(map(abs, self.peer.joint_velocities())) > _FAST_RAD_S)
 
     def place(self) -> list[float]:
         return list(self.peer.joint_positions())
@@ -273,7 +275,7 @@ class RospyArm:
         return far(self._robot.positions())
 
     def moves(self) -> bool:
-        return max(map(abs, self._robot.state()["velocity"].values())) > _FAST_RAD_S
+        return bool(max(map(abs, self._robot.state()["velocity"].values())) > _FAST_RAD_S)
 
     def now_s(self) -> float:
         return float(self._robot.state()["time_s"])
@@ -320,7 +322,7 @@ class WalkingNao(_BehindProxies):
 
     def moves(self) -> bool:
         state = self._peer.state()
-        return any(state["twist"]) and abs(state["velocity"]["HeadYaw"]) > 1.0
+        return bool(any(state["twist"]) and abs(state["velocity"]["HeadYaw"]) > 1.0)
 
     def now_s(self) -> float:
         return time.monotonic()
