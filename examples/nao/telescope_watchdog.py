@@ -20,9 +20,10 @@ CHECK_S = 0.02
 BEATS_S = 0.15
 """The robot stops when the number has not changed for this time [s]."""
 LATE_S = 120.0
-"""TCP may deliver commands of a lost connection for this time [s]. Until then every walk is stopped again."""
+"""TCP may deliver commands of a lost connection for this time [s]. Until then every motion is stopped again."""
 LAG_RAD = 0.1
 """Largest distance of a joint that holds from its command [rad]."""
+MOVED_RAD = 0.02
 FRACTION = 0.2
 """Speed at which a joint returns to its measured angle, as a share of the highest."""
 LEGS = ("Hip", "Knee", "Ankle")
@@ -45,6 +46,7 @@ class Watchdog:
         memory.insertData(BEAT, 0)
         self._last = self._missed = 0
         self._held = True
+        self._targets = {}
 
     def check(self):
         """Stop the robot if the beats have ended. The number 0 means that they have ended on purpose."""
@@ -60,9 +62,14 @@ class Watchdog:
         if BEATS_S < silent_s < LATE_S:
             if not self._held or self._motion.moveIsActive():
                 self._motion.stopMove()
-            if not self._held:
+            if not self._held or self._has_new_commands():
                 self._hold()
                 self._held = True
+
+    def _has_new_commands(self):
+        """Whether a joint is commanded to leave the angle that it holds."""
+        commanded = zip(self._names, self._motion.getAngles("Body", False))
+        return any(abs(angle - self._targets.get(name, angle)) > MOVED_RAD for name, angle in commanded)
 
     def _hold(self):
         """Keep the present commands, which carry the load. NAOqi moves the legs to the end of the last step."""
@@ -73,6 +80,7 @@ class Watchdog:
             if not (walks and any(part in name for part in LEGS)):
                 targets[name] = command if abs(command - angle) < LAG_RAD else angle
         self._motion.setAngles(list(targets), list(targets.values()), FRACTION)
+        self._targets = targets
 
 
 def main(url):

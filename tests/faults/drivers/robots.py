@@ -306,7 +306,7 @@ class RospyArm:
 class WalkingNao(_BehindProxies):
     """A NAO that walks and moves its head. At most one command of each kind is in its network."""
 
-    late_rad = 0.1
+    late_rad = 0.3
     period_s = NAO.period_ms / 1000
 
     def __init__(self) -> None:

@@ -146,13 +146,14 @@ def real_robot(machine: Machine, variant: str, folder: Path) -> Iterator[Robot]:
         stack.callback(api.http.delete, f"/agents/{agent}")
         _configure(home / "agent.toml", label, peer.options)
         trace = stack.enter_context(contextlib.closing(PeerTrace(peer.joints, peer.positions)))
-        stack.enter_context(_running(home))
+        stack.enter_context(running_agent(home))
         wait_until(lambda: (api.device("real")["state"] or {}).get("mode") == "idle", "the robot to be ready")
         yield Robot(machine, "real", label, trace)
 
 
 @contextlib.contextmanager
-def _running(home: Path) -> Iterator[None]:
+def running_agent(home: Path) -> Iterator[None]:
+    """An agent, until the context ends."""
     with (home / "output.log").open("w") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "device_agent", "run", "--home", str(home)],
