@@ -81,9 +81,9 @@ class PeerTrace(Trace):
 
 @dataclass(frozen=True)
 class Peer:
-    """A running peer and the device that drives it: ``NAME=TYPE:DRIVER`` with its options."""
+    """A running peer and the device that drives it: ``TYPE:DRIVER`` with its options."""
 
-    device: str
+    driven: str
     options: Mapping[str, object]
     joints: Sequence[str]
     positions: Callable[[], Sequence[float]]
@@ -93,7 +93,7 @@ class Peer:
 def naoqi(_folder: Path) -> Iterator[Peer]:
     """A NAO with NAOqi."""
     with contextlib.closing(NaoPeer(NAO, NAOQI_PYTHON)) as peer:
-        yield Peer("real=nao:naoqi", peer.options(), _joints(NAO), peer.joint_positions)
+        yield Peer("nao:naoqi", peer.options(), _joints(NAO), peer.joint_positions)
 
 
 @contextlib.contextmanager
@@ -101,14 +101,14 @@ def rtde(_folder: Path) -> Iterator[Peer]:
     """A UR5 with its own controller."""
     with contextlib.closing(UrPeer(ARM)) as peer:
         options = {"address": "127.0.0.1", "rtde_port": peer.rtde_port, "script_port": peer.script_port}
-        yield Peer("real=ur5:ur", options, _joints(ARM), peer.joint_positions)
+        yield Peer("ur5:ur", options, _joints(ARM), peer.joint_positions)
 
 
 @contextlib.contextmanager
 def rosbridge(_folder: Path) -> Iterator[Peer]:
     """A UR5 with ROS behind rosbridge."""
     with contextlib.closing(RosPeer(ARM)) as peer:
-        yield Peer("real=ur5:ros", peer.options(), _joints(ARM), peer.joint_positions)
+        yield Peer("ur5:ros", peer.options(), _joints(ARM), peer.joint_positions)
 
 
 @contextlib.contextmanager
@@ -123,7 +123,7 @@ def rospy(folder: Path) -> Iterator[Peer]:
             "command": {"topic": "/arm_controller/command"},
             "safety": [{"topic": "/emergency_stop", "type": "std_msgs/Bool", "normal": [False]}],
         }
-        yield Peer("real=ur5:ros", options, _joints(ARM), robot.positions)
+        yield Peer("ur5:ros", options, _joints(ARM), robot.positions)
 
 
 PEERS: Mapping[str, Callable[[Path], contextlib.AbstractContextManager[Peer]]] = {
@@ -142,13 +142,13 @@ def real_robot(machine: Machine, variant: str, folder: Path) -> Iterator[Robot]:
     with contextlib.ExitStack() as stack:
         peer = stack.enter_context(PEERS[variant](folder))
         api = stack.enter_context(machine.api())
-        agent = enroll(machine, api, home, peer.device)
+        agent = enroll(machine, api, home, f"{variant}={peer.driven}")
         stack.callback(api.http.delete, f"/agents/{agent}")
         _configure(home / "agent.toml", label, peer.options)
         trace = stack.enter_context(contextlib.closing(PeerTrace(peer.joints, peer.positions)))
         stack.enter_context(running_agent(home))
-        wait_until(lambda: (api.device("real")["state"] or {}).get("mode") == "idle", "the robot to be ready")
-        yield Robot(machine, "real", label, trace)
+        wait_until(lambda: (api.device(variant)["state"] or {}).get("mode") == "idle", "the robot to be ready")
+        yield Robot(machine, variant, label, trace)
 
 
 @contextlib.contextmanager
