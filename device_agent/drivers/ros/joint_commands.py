@@ -52,6 +52,7 @@ class JointCommands:
 
     def __init__(self, robot_type: RobotType, names: Sequence[str], command: Command, dialect: Dialect) -> None:
         self._joints = robot_type.joints
+        self._speeds = [_MARGIN * joint.max_velocity_rad_s for joint in robot_type.joints]
         self._braking_rad_s2 = robot_type.braking_rad_s2
         self._names = tuple(names)
         self._command = command
@@ -67,7 +68,7 @@ class JointCommands:
         self.type = dialect.type(_TYPES[command.kind])
 
     def towards(self, target_rad: Sequence[float], measured: Measurement, now_s: float) -> Publication | None:
-        """The command for a target within the limits.
+        """The command for a target within the limits, not far from the measured position.
 
         ``None`` if the previous one was just sent, or if measurements are overdue. Commands would then queue in the
         network, and the robot would make up for them at once.
@@ -79,10 +80,17 @@ class JointCommands:
             self._position, self._since_s, elapsed_s = measured.position_rad, now_s, self._interval_s
         elapsed_s = min(elapsed_s, _LATE * self._interval_s)
         running_s = now_s - self._since_s + self._interval_s
+        # The robot follows by less than this time, so only one that does not follow, or does not report, is affected.
+        lead_s = self._horizon_s + (measured.fresh_until_s - measured.at_s) / 2
         self._position = tuple(
-            position + min(max(target - position, -step), step)
-            for position, target, step in zip(
-                self._position, target_rad, self._steps(running_s, elapsed_s), strict=True
+            min(max(position + min(max(target - position, -step), step), at - lead_s * speed), at + lead_s * speed)
+            for position, target, step, at, speed in zip(
+                self._position,
+                target_rad,
+                self._steps(running_s, elapsed_s),
+                measured.position_rad,
+                self._speeds,
+                strict=True,
             )
         )
         self._sent_s = now_s
@@ -103,8 +111,8 @@ class JointCommands:
     def _steps(self, running_s: float, elapsed_s: float) -> list[float]:
         """Largest changes of the commanded positions [rad]."""
         return [
-            min(_MARGIN * joint.max_velocity_rad_s, _RAMP * joint.max_acceleration_rad_s2 * running_s) * elapsed_s
-            for joint in self._joints
+            min(speed, _RAMP * joint.max_acceleration_rad_s2 * running_s) * elapsed_s
+            for joint, speed in zip(self._joints, self._speeds, strict=True)
         ]
 
     def _publication(self, position_rad: Sequence[float], duration_s: float) -> Publication:

@@ -28,7 +28,7 @@ from tests.faults.drivers.robots import (
 from tests.harness.robots.ros.ros_system import ros_system
 
 LIMIT_S = 0.35
-QUIET_S = 0.5
+QUIET_S = 0.4
 """Time without a motion after the repair [s]."""
 STILL_RAD = 5e-3
 ROBOTS: dict[str, Callable[[], Robot]] = {"naoqi": WalkingNao, "ur": RtdeArm, "rosbridge": RosbridgeArm}
@@ -44,13 +44,21 @@ def robot(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Robot]:
             yield robot
 
 
+def start(robot: Robot) -> Operator:
+    """Connect and move. If the connection is lost meanwhile, connect again, as the agent does."""
+    for _ in range(5):
+        connect(robot)
+        operator = Operator(robot)
+        until(lambda: robot.moves() or operator.error, within_s=60.0)  # noqa: B023 (called in this iteration)
+        if operator.error is None:
+            return operator
+    raise operator.error
+
+
 def cut_in_motion(robot: Robot, kind: Cut, delay_s: float) -> float:
     """Cut once, repair, and connect again. Returns the time from the cut to rest [s]."""
-    connect(robot)
-    operator = Operator(robot)
-    until(robot.moves)
+    operator = start(robot)
     time.sleep(delay_s)
-    until(robot.moves)
     cut_s = robot.cut(kind)
     assert isinstance(operator.wait(), UnreachableError)
     until(lambda: robot.now_s() > max(robot.moved_s(), cut_s) + QUIET_S)

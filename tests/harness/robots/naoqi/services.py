@@ -4,6 +4,7 @@ It prints its address, then answers each JSON line on its standard input with on
 ``answer``. Joints move at a constant speed. A walk lasts until it is stopped.
 """
 
+import collections
 import json
 import math
 import sys
@@ -33,7 +34,7 @@ class Body:
         self.fallen, self.fall_manager, self.posture = False, True, "Standing"
         self.spoken, self.calls, self.language = [], [], "English"
         self.speaking = threading.Event()
-        self.memory = {}
+        self.memory, self.checks = {}, collections.deque(maxlen=400)
         self.disturbance, self.old_ms = "", 0
         self.rest_s: float | None = time.monotonic()
         threading.Thread(target=self.run, daemon=True).start()
@@ -154,6 +155,9 @@ class ALMemory:
             return self.body.old_ms if self.body.disturbance == "clock" else int(time.monotonic() * 1000)
         if key == "robotHasFallen":
             return 1.0 if self.body.fallen else 0.0
+        if key == "Telescope/Beat":
+            with self.body.lock:
+                self.body.checks.append(time.monotonic())
         if key in self.body.memory:
             return self.body.memory[key]
         raise RuntimeError(f"no data '{key}'")
@@ -262,7 +266,7 @@ class Nao:
                 "calls",
                 "language",
             )
-            return {name: getattr(body, name) for name in state}
+            return {name: getattr(body, name) for name in state} | {"checks": list(body.checks)}
 
 
 def main(body):
