@@ -224,7 +224,7 @@ class RtdeArm(_Arm):
 
 
 class RosbridgeArm(_Arm):
-    """A UR5 with ROS behind rosbridge. Late commands are not further from the last measurement than it moves in 0.25 s."""
+    """A UR5 with ROS behind rosbridge. Late commands lead the last measurement by at most 0.25 s."""
 
     late_rad = 0.25 * 1.1 * _MAX_RAD_S
 

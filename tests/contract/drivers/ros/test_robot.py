@@ -11,6 +11,7 @@ import pytest
 
 from device_agent.drivers.ros import RosBaseDriver, RosDriver
 from device_agent.drivers.ros.joint_commands import Publication
+from device_agent.drivers.ros.rosbridge import RosbridgeChannel
 from device_agent.drivers.testing.peer import Disturbance
 from device_agent.ports.driver import DriverError, Twist, UnreachableError
 from tests.harness.robots.ros import robot as topics
@@ -321,6 +322,30 @@ def test_a_robot_that_does_not_receive_is_lost(driver: RosDriver, peer: RosPeer)
         until(lambda: connection.publish(large))
     with pytest.raises(UnreachableError, match="is lost"):
         driver.send(HOME)
+
+
+def test_a_closed_connection_delivers_nothing_later(peer: RosPeer) -> None:
+    channel = RosbridgeChannel(f"127.0.0.1:{peer.server.port}")
+    until(lambda: peer.server._clients)
+    sent = 0
+    with peer._lock:  # the robot's computer receives nothing
+        with pytest.raises((BlockingIOError, ConnectionError)):
+            while True:
+                channel.send(b"x" * 10_000)
+                sent += 10_000
+        channel.close()
+        client, received = peer.server._clients[0]._socket, 0
+        with pytest.raises(ConnectionResetError):
+            while data := client.recv(65536):
+                received += len(data)
+    assert received < sent
+
+
+def test_the_last_command_before_a_close_is_delivered(driver: RosDriver, peer: RosPeer) -> None:
+    driver.connect()  # with a command to hold
+    driver.halt()
+    driver.close()
+    peer.wait(lambda robot: robot.commands == 2)
 
 
 def test_rejections_of_rosbridge_are_reported(peer: RosPeer) -> None:
