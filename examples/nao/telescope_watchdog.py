@@ -32,7 +32,7 @@ LEGS = ("Hip", "Knee", "Ankle")
 class Watchdog:
     """Checks the beats.
 
-    Time is counted in checks: Python 2.7 has no clock that nobody can set.
+    Time is counted in checks: Python 2.7 has no monotonic clock.
 
     Args:
         memory: The service ``ALMemory``.

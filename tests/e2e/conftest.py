@@ -54,10 +54,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
         yield machine
 
 
-VARIANTS = {
-    "arm": ("ur5", "UR5", ("rtde", "rosbridge", "rospy")),
-    "humanoid": ("nao", "NAO", ("naoqi",)),
-}
+VARIANTS = {"arm": ("ur5", "UR5", ("rtde", "rosbridge", "rospy")), "humanoid": ("nao", "NAO", ("naoqi",))}
 """Fixture → device, its label, and the protocols of real robots."""
 
 

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,7 +138,8 @@ def move(api: Api, name: str, peer: Peer) -> None:
 
 
 @pytest.fixture
-def site(machine: Machine, tmp_path: Path) -> Site:
+def site(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
+    monkeypatch.delenv("TELESCOPE_AGENT_HOME", raising=False)  # the pages use the default, below the home folder
     return Site(machine, tmp_path)
 
 
@@ -235,10 +236,3 @@ def test_each_configuration_of_a_page_is_followed() -> None:
         for each in blocks(page):
             if each.language == "toml" and each.use == "file":
                 assert f'"{page.name}", "{each.argument}"' in source, f"{page.name}: {each.argument}"
-
-
-@pytest.fixture(autouse=True)
-def _own_home(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The pages use the agent's default folder, below the home folder of each test."""
-    monkeypatch.delenv("TELESCOPE_AGENT_HOME", raising=False)
-    yield
