@@ -17,7 +17,7 @@ import qi
 
 BEAT, ECHO = "Telescope/Beat", "Telescope/Echo"
 CHECK_S = 0.02
-BEATS_S = 0.15
+BEATS_S = 0.12
 """The robot stops when the number has not changed for this time [s]."""
 LATE_S = 120.0
 """TCP may deliver commands of a lost connection for this time [s]. Until then every motion is stopped again."""

@@ -99,6 +99,7 @@ def follow(site: Site, device: str, peer: Peer, command: str = "") -> None:
         command: The page's command to enrol; the one of the guide without one.
     """
     (entry,) = tomllib.loads(device)["devices"]
+    joint = robot_types.load(ROBOTS / entry["type"]).joints[0].name
     name, driven = entry["name"], f"{entry['name']}={entry['type']}:{entry['driver']}"
     command = command or f"telescope-agent enroll --server https://telescope.example --device {driven}"
     assert driven in command
@@ -110,7 +111,7 @@ def follow(site: Site, device: str, peer: Peer, command: str = "") -> None:
         assert f"driver '{entry['driver']}': real" in site.shell("telescope-agent doctor")
         stack.enter_context(running_agent(site.agent_home))
         wait_until(lambda: state(api, name).get("mode") == "idle", "the robot to be ready")
-        move(api, name, peer)
+        move(api, name, joint, peer)
 
         peer.disturb(Disturbance.CONNECTION)
         wait_until(lambda: state(api, name).get("faults"), "the fault of a device without a connection")
@@ -118,17 +119,16 @@ def follow(site: Site, device: str, peer: Peer, command: str = "") -> None:
         peer.restore()
         wait_until(lambda: not state(api, name).get("faults"), "the connection")
         assert peer.joint_positions() == pytest.approx(before, abs=0.01)
-        move(api, name, peer)
+        move(api, name, joint, peer)
 
 
 def state(api: Api, name: str) -> dict[str, Any]:
     return api.device(name)["state"] or {}
 
 
-def move(api: Api, name: str, peer: Peer) -> None:
-    """Move the first joint by a small angle."""
+def move(api: Api, name: str, joint: str, peer: Peer) -> None:
+    """Move the first joint of the robot type by a small angle."""
     device = api.device(name)
-    joint = robot_types.load(ROBOTS / device["type"]).joints[0].name
     position = peer.joint_positions()[0]
     target = position + (STEP_RAD if position < 0 else -STEP_RAD)
     request = {"kind": "move_joints", "position_rad": {joint: target}}

@@ -29,6 +29,7 @@ _FAST_RAD_S = 2.0
 _MAX_RAD_S = max(joint.max_velocity_rad_s for joint in ARM.joints)
 _CHECK_S = 0.04
 """Longest time between two checks of the watchdog on a machine that is not busy [s]."""
+_UNDERWAY_S = 0.2
 _WALK = Twist(forward_m_s=0.05, turn_rad_s=0.1)
 
 
@@ -318,7 +319,7 @@ class WalkingNao(_BehindProxies):
         super().__init__(int(self._peer.url.rpartition(":")[2]))
         url = f"tcp://127.0.0.1:{self._proxies[0].port}"
         self.driver = NaoqiDriver(NAO, ROBOTS / "nao", url=url, python=str(NAOQI_PYTHON), device="nao")
-        self._changed_s = math.inf
+        self._changed_s, self._is_cut = math.inf, False
 
     def far(self) -> list[float]:
         target = list(self._peer.joint_positions())
@@ -333,12 +334,17 @@ class WalkingNao(_BehindProxies):
         return time.monotonic()
 
     def moved_s(self) -> float:
-        """Without the time in which a busy machine did not run the robot's own program, the watchdog."""
+        """As if the machine was not busy.
+
+        A beat counts as the last one if it reached the robot within 0.2 s of the cut. The time in which the robot's own
+        program, the watchdog, was not run is excluded.
+        """
         state = self._peer.state()
         rest_s = time.monotonic() if state["rest_s"] is None else float(state["rest_s"])
         checks = [check_s for check_s in state["checks"] if self._changed_s < check_s < rest_s]
         gaps_s = [after - before - _CHECK_S for before, after in itertools.pairwise([self._changed_s, *checks, rest_s])]
-        return rest_s - sum(max(gap_s, 0.0) for gap_s in gaps_s)
+        beat_s = min(max(state["inserted_s"] - self._changed_s, 0.0), _UNDERWAY_S) if self._is_cut else 0.0
+        return float(rest_s - beat_s - sum(max(gap_s, 0.0) for gap_s in gaps_s))
 
     def place(self) -> list[float]:
         state = self._peer.state()
@@ -346,11 +352,11 @@ class WalkingNao(_BehindProxies):
 
     def cut(self, cut: Cut) -> float:
         self._cut(cut)
-        self._changed_s = self.now_s()
+        self._changed_s, self._is_cut = self.now_s(), True
         return self._changed_s
 
     def restore(self, cut: Cut) -> None:
-        self._changed_s = self.now_s()
+        self._changed_s, self._is_cut = self.now_s(), False
         super().restore(cut)
 
     def close(self) -> None:

@@ -52,7 +52,7 @@ def start(robot: Robot) -> Operator:
         until(lambda: robot.moves() or operator.error, within_s=60.0)  # noqa: B023 (called in this iteration)
         if operator.error is None:
             return operator
-    raise operator.error
+    pytest.fail(f"the connection is lost before the robot moves: {operator.error}")
 
 
 def cut_in_motion(robot: Robot, kind: Cut, delay_s: float) -> float:

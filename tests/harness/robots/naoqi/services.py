@@ -34,7 +34,9 @@ class Body:
         self.fallen, self.fall_manager, self.posture = False, True, "Standing"
         self.spoken, self.calls, self.language = [], [], "English"
         self.speaking = threading.Event()
-        self.memory, self.checks = {}, collections.deque(maxlen=400)
+        self.memory: dict[str, int] = {}
+        self.checks: collections.deque[float] = collections.deque(maxlen=400)
+        self.inserted_s = 0.0
         self.disturbance, self.old_ms = "", 0
         self.rest_s: float | None = time.monotonic()
         threading.Thread(target=self.run, daemon=True).start()
@@ -165,6 +167,7 @@ class ALMemory:
     def insertData(self, key, value):
         with self.body.lock:
             self.body.memory[key] = value
+            self.body.inserted_s = time.monotonic() if key == "Telescope/Beat" else self.body.inserted_s
 
     def getListData(self, keys):
         return [float(30 + self.body.joints.index(key.split("/")[2])) for key in keys]
@@ -260,6 +263,7 @@ class Nao:
                 "twist",
                 "pose",
                 "rest_s",
+                "inserted_s",
                 "stiffness",
                 "fraction",
                 "spoken",
