@@ -123,7 +123,7 @@ class Bridge:
                 os._exit(1)
 
     def _is_unheard(self, topic: str) -> bool:
-        """Whether no subscriber has connected since the first message. ``rospy`` does not repeat a failed connection."""
+        """Whether no subscriber has connected since the first message. ``rospy`` does not try again."""
         return time.monotonic() - self._first_s.get(topic, math.inf) > _SUBSCRIBER_S
 
     def _brake(self, *, newest_s: float) -> None:
