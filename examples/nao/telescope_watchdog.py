@@ -68,14 +68,14 @@ class Watchdog:
 
     def _has_new_commands(self):
         """Whether a joint is commanded to leave the angle that it holds."""
-        commanded = zip(self._names, self._motion.getAngles("Body", False))
+        commanded = zip(self._names, self._motion.getAngles(self._names, False))
         return any(abs(angle - self._targets.get(name, angle)) > MOVED_RAD for name, angle in commanded)
 
     def _hold(self):
         """Keep the present commands, which carry the load. NAOqi moves the legs to the end of the last step."""
         walks = self._motion.moveIsActive()
         targets = {}
-        measured, commanded = self._motion.getAngles("Body", True), self._motion.getAngles("Body", False)
+        measured, commanded = self._motion.getAngles(self._names, True), self._motion.getAngles(self._names, False)
         for name, angle, command in zip(self._names, measured, commanded):
             if not (walks and any(part in name for part in LEGS)):
                 targets[name] = command if abs(command - angle) < LAG_RAD else angle

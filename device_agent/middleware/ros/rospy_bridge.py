@@ -41,12 +41,14 @@ class Bridge:
         link: Socket to the agent.
         rospy: The library. It is imported after its folders are known.
         genpy: The library of its messages.
+        needs_subscribers: Whether the process ends when nobody receives a topic that it publishes.
     """
 
-    def __init__(self, link: socket.socket, rospy: Any, genpy: Any) -> None:
+    def __init__(self, link: socket.socket, rospy: Any, genpy: Any, *, needs_subscribers: bool) -> None:
         self._link = link
         self._rospy = rospy
         self._genpy = genpy
+        self._needs_subscribers = needs_subscribers
         self._sending = threading.Lock()
         self._publishers: dict[str, Any] = {}
         self._subscribed: set[str] = set()
@@ -112,7 +114,8 @@ class Bridge:
         while True:
             time.sleep(_CHECK_S)
             self._brake(newest_s=time.monotonic() - WATCHDOG_S)
-            self._check_subscribers()
+            if self._needs_subscribers:
+                self._check_subscribers()
 
     def _check_subscribers(self) -> None:
         for topic, publisher in list(self._publishers.items()):
@@ -184,8 +187,11 @@ def watch_master(bridge: Bridge, address: str, first: int) -> None:
 
 
 def main() -> None:
-    """Arguments: name of the node, address of the master, folders of ROS's Python packages."""
-    name, master, *folders = sys.argv[1:]
+    """Arguments: name of the node, address of the master, needs_subscribers, folders of ROS's Python packages.
+
+    ``needs_subscribers`` is empty if topics may have no subscriber.
+    """
+    name, master, needs_subscribers, *folders = sys.argv[1:]
     sys.path[:0] = folders
     link = socket.socket(fileno=os.dup(0))
 
@@ -205,7 +211,7 @@ def main() -> None:
         rospy.init_node(name, anonymous=True, disable_signals=True)
     except Exception as error:  # noqa: BLE001 (as above)
         fail(f"rospy cannot be used: {type(error).__name__}: {error}")
-    bridge = Bridge(link, rospy, genpy)
+    bridge = Bridge(link, rospy, genpy, needs_subscribers=bool(needs_subscribers))
     threading.Thread(target=watch_master, args=(bridge, master, first), daemon=True).start()
     bridge.report("none", "ready")
     bridge.run()
