@@ -41,7 +41,7 @@ class Bridge:
         link: Socket to the agent.
         rospy: The library. It is imported after its folders are known.
         genpy: The library of its messages.
-        needs_subscribers: Whether the process ends when nobody receives a topic that it publishes.
+        needs_subscribers: Whether the process ends when a topic that it publishes has no subscriber.
     """
 
     def __init__(self, link: socket.socket, rospy: Any, genpy: Any, *, needs_subscribers: bool) -> None:

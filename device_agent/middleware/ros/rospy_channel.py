@@ -27,8 +27,8 @@ class RospyChannel(BridgeProcess):
         folders: Folders of ROS's Python packages; empty if the interpreter finds them.
         master: Address of the ROS master: ``http://robot:11311``.
         node: Name of the node; ROS appends a number.
-        needs_subscribers: Whether the channel is lost when nobody receives a topic that it publishes, as for the
-            commands of a robot.
+        needs_subscribers: Whether the channel is lost when a topic that it publishes has no subscriber. Commands
+            of a robot need one.
 
     Raises:
         UnreachableError: The bridge cannot be started, or there is no master.
