@@ -355,7 +355,9 @@ def main() -> None:
     channel = (
         RosbridgeChannel(options.rosbridge, certificate_authority=options.certificate_authority)
         if options.rosbridge
-        else RospyChannel(python=options.python, folders=(), master=options.master, node="telescope_bridge")
+        else RospyChannel(
+            python=options.python, folders=(), master=options.master, node="telescope_bridge", needs_subscribers=False
+        )
     )
     bridge.connection = Connection(
         channel,

@@ -10,6 +10,7 @@ from playwright.sync_api import Browser, Playwright, sync_playwright
 
 from tests.harness.browser.browser import FLAT, chromium
 from tests.harness.browser.product import Machine, start_machine
+from tests.harness.browser.robots import SIMULATED, Robot, real_robot
 
 LABORATORY = {
     "test_health_pages",
@@ -51,6 +52,41 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     with start_machine(tmp_path_factory.mktemp("laboratory"), TELESCOPE_ROOM="lab") as machine:
         assert machine.process.poll() is None, "".join(machine.lines)
         yield machine
+
+
+VARIANTS = {"arm": ("ur5", "UR5", ("rtde", "rosbridge", "rospy")), "humanoid": ("nao", "NAO", ("naoqi",))}
+"""Fixture → device, its label, and the protocols of real robots."""
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run the tests of a robot with the simulation and behind each protocol. Of the latter ``make test`` runs one."""
+    for fixture, (_, _, protocols) in VARIANTS.items():
+        if fixture in metafunc.fixturenames:
+            real = [pytest.param(name, marks=pytest.mark.one_of("driver variants")) for name in protocols]
+            metafunc.parametrize(fixture, [SIMULATED, *real], indirect=True, scope="module")
+
+
+@pytest.fixture(scope="module")
+def arm(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    """A UR5."""
+    yield from _robot("arm", request, tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def humanoid(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    """A NAO."""
+    yield from _robot("humanoid", request, tmp_path_factory)
+
+
+def _robot(fixture: str, request: pytest.FixtureRequest, folders: pytest.TempPathFactory) -> Iterator[Robot]:
+    name, label, _ = VARIANTS[fixture]
+    product = "laboratory" if request.path.stem in LABORATORY else "machine"
+    machine: Machine = request.getfixturevalue(product)
+    if request.param == SIMULATED:
+        yield Robot(machine, name, label, machine.trace(name))
+    else:
+        with real_robot(machine, request.param, folders.mktemp(request.param)) as robot:
+            yield robot
 
 
 @pytest.fixture(scope="package")

@@ -52,7 +52,11 @@ class Measurement(msgspec.Struct, frozen=True, tag="measurement"):
 
 
 class Status(msgspec.Struct, frozen=True, tag="status"):
-    """Values that change slowly. ``stiffness`` and ``temperature_c`` are in the order of the joints."""
+    """Values that change slowly. ``stiffness`` and ``temperature_c`` are in the order of the joints.
+
+    Attributes:
+        guarded: Whether a watchdog on the robot stops it when the network fails.
+    """
 
     at_s: float
     stiffness: tuple[float, ...]
@@ -64,6 +68,7 @@ class Status(msgspec.Struct, frozen=True, tag="status"):
     pose: tuple[float, float, float]
     twist: tuple[float, float, float]
     battery_percent: float
+    guarded: bool
 
 
 class TaskEnd(msgspec.Struct, frozen=True, tag="task"):

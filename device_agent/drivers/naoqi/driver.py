@@ -127,7 +127,7 @@ class NaoqiDriver:
         )
 
     def faults(self) -> tuple[DriverFault, ...]:
-        """A fall, limp joints that should hold, and a fall manager that is off."""
+        """A fall, limp joints that should hold, a fall manager that is off, and a missing watchdog."""
         status = None if self._connection is None else self._connection.status
         return () if status is None else self._faults(status)
 
@@ -151,12 +151,13 @@ class NaoqiDriver:
         return tuple(applied)
 
     def drive(self, twist: Twist) -> Twist:
-        """Walk with a velocity within the limits of the base; a walk starts only while the robot stands."""
+        """Walk with a velocity within the limits of the base, while the robot stands and has its watchdog."""
         connection, status = self._free()
         if self._own:
             return REST
         applied = limit_twist(self._type, twist)
-        if max(map(abs, applied)) < _STILL or not (self._walks(status) or status.posture == _STANDING):
+        may_walk = status.guarded and (self._walks(status) or status.posture == _STANDING)
+        if max(map(abs, applied)) < _STILL or not may_walk:
             applied = REST
         else:
             self._walked_s = time.monotonic()
@@ -312,6 +313,9 @@ class NaoqiDriver:
         if not status.fall_manager:
             message = "the fall manager is off: the robot does not protect itself when it falls"
             faults.append(DriverFault("fall-manager-off", message, stops=False))
+        if not status.guarded:
+            message = "the robot does not walk: its program telescope_watchdog.py does not run"
+            faults.append(DriverFault("no-watchdog", message, stops=False))
         return tuple(faults)
 
     def _walks(self, status: Status) -> bool:

@@ -21,6 +21,8 @@ _MARGIN = 1.1
 """Highest speed of the commands as a multiple of the agent's limit, so that they catch up with a late period."""
 _EARLY = 0.75
 """A command may be sent after this share of the interval, because periods are not exact."""
+_LATE = 2.0
+"""Longest interval for which one command makes up, in intervals. The robot brakes meanwhile, and starts again."""
 _TYPES = {
     "trajectory": "trajectory_msgs/JointTrajectory",
     "positions": "std_msgs/Float64MultiArray",
@@ -47,6 +49,7 @@ class JointCommands:
         self._order = [names.index(name) for name in command.joints or names]
         self._names = [names[index] for index in self._order]
         self._joints = [robot_type.joints[index] for index in self._order]
+        self._speeds = [_MARGIN * joint.max_velocity_rad_s for joint in self._joints]
         self._braking_rad_s2 = robot_type.braking_rad_s2
         self._command = command
         self._dialect = dialect
@@ -65,7 +68,10 @@ class JointCommands:
         return {self._command.topic: self._dialect.type(_TYPES[self._command.kind])}
 
     def towards(self, target_rad: Sequence[float], measured: Measurement, now_s: float) -> Request | None:
-        """The command for a target within the limits; ``None`` if nothing has to be sent now.
+        """The command for a target within the limits, not far from the measured position.
+
+        ``None`` if nothing has to be sent now, or if measurements are overdue. Commands would then queue in the
+        network, and the robot would make up for them at once.
 
         Args:
             target_rad: Positions of all joints of the robot type [rad].
@@ -73,17 +79,27 @@ class JointCommands:
             now_s: The monotonic clock [s].
         """
         elapsed_s = now_s - self._sent_s
-        if elapsed_s < _EARLY * self._interval_s:
+        if elapsed_s < _EARLY * self._interval_s or now_s > measured.fresh_until_s:
             return None
         target = self._own(target_rad)
         if self.goals is not None and target == self._completed:
             return None  # another goal would replace this one, whose result would never arrive
         if elapsed_s > self._horizon_s:
             self._position, self._since_s, elapsed_s = self._own(measured.position_rad), now_s, self._interval_s
+        elapsed_s = min(elapsed_s, _LATE * self._interval_s)
         running_s = now_s - self._since_s + self._interval_s
+        # The robot follows by less than this time, so only one that does not follow, or does not report, is affected.
+        lead_s = self._horizon_s + (measured.fresh_until_s - measured.at_s) / 2
         self._position = tuple(
-            position + min(max(aim - position, -step), step)
-            for position, aim, step in zip(self._position, target, self._steps(running_s, elapsed_s), strict=True)
+            min(max(position + min(max(aim - position, -step), step), at - lead_s * speed), at + lead_s * speed)
+            for position, aim, step, at, speed in zip(
+                self._position,
+                target,
+                self._steps(running_s, elapsed_s),
+                self._own(measured.position_rad),
+                self._speeds,
+                strict=True,
+            )
         )
         self._sent_s = now_s
         self._completed = target if self._position == target else ()
@@ -107,8 +123,8 @@ class JointCommands:
     def _steps(self, running_s: float, elapsed_s: float) -> list[float]:
         """Largest changes of the commanded positions [rad]."""
         return [
-            min(_MARGIN * joint.max_velocity_rad_s, _RAMP * joint.max_acceleration_rad_s2 * running_s) * elapsed_s
-            for joint in self._joints
+            min(speed, _RAMP * joint.max_acceleration_rad_s2 * running_s) * elapsed_s
+            for joint, speed in zip(self._joints, self._speeds, strict=True)
         ]
 
     def _request(self, position_rad: Sequence[float], duration_s: float, *, due_s: float | None) -> Request:

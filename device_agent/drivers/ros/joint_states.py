@@ -11,16 +11,26 @@ _MAX_DELAY_S = 1.0
 """A message that took this much longer than the fastest ones is outdated [s]."""
 _WINDOW_S = 60.0
 """The fastest messages of one or two such windows count, because clocks drift [s]."""
+_FRESH_S = (0.1, 0.3)
+"""Bounds of the age of a measurement that counts as fresh [s]."""
+_FRESH_INTERVALS = 3.0
+_SMOOTHING = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """All joints, in the order of the robot type. ``at_s``: arrival of the oldest value [s]."""
+    """All joints, in the order of the robot type.
+
+    Attributes:
+        at_s: Arrival of the oldest value [s].
+        fresh_until_s: When the next one is overdue: the connection stalls [s].
+    """
 
     position_rad: tuple[float, ...]
     velocity_rad_s: tuple[float, ...]
     effort_nm: tuple[float, ...]
     at_s: float
+    fresh_until_s: float
 
 
 class _Joint(NamedTuple):
@@ -47,6 +57,7 @@ class JointStates:
         self._names = tuple(names)
         self._joints: dict[str, _Joint] = {}
         self._delay = _Delay() if check_delay else None
+        self._interval_s = 0.0
         self.newest: Measurement | None = None
 
     def accept(self, message: JointState, at_s: float) -> None:
@@ -99,13 +110,19 @@ class JointStates:
 
     def _merge(self) -> None:
         known = [joint for name in self._names if (joint := self._joints.get(name)) and joint.known_new]
-        if len(known) == len(self._names):
-            self.newest = Measurement(
-                tuple(joint.position_rad for joint in known),
-                tuple(joint.velocity_rad_s for joint in known),
-                tuple(joint.effort_nm for joint in known),
-                min(joint.at_s for joint in known),
-            )
+        if len(known) < len(self._names):
+            return
+        at_s = min(joint.at_s for joint in known)
+        if self.newest is not None and at_s > self.newest.at_s:
+            elapsed_s = min(at_s - self.newest.at_s, _FRESH_S[1])
+            self._interval_s += _SMOOTHING * (elapsed_s - self._interval_s)
+        self.newest = Measurement(
+            tuple(joint.position_rad for joint in known),
+            tuple(joint.velocity_rad_s for joint in known),
+            tuple(joint.effort_nm for joint in known),
+            at_s,
+            at_s + min(max(_FRESH_INTERVALS * self._interval_s, _FRESH_S[0]), _FRESH_S[1]),
+        )
 
 
 class _Delay:

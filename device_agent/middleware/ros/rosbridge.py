@@ -5,9 +5,12 @@ connection is used. Frames to send are built without shared state, so that no th
 """
 
 import contextlib
+import fcntl
 import select
 import socket
 import ssl
+import struct
+import termios
 import time
 from collections.abc import Sequence
 
@@ -23,6 +26,8 @@ from device_agent.ports.driver import UnreachableError
 _TIMEOUT_S = 2.0
 """Time to connect, and for the response [s]."""
 _CHECK_S = 0.1
+_DELIVERY_S = 0.1
+"""Time to deliver the last messages before the socket is closed [s]."""
 _DEFAULT_PORT = 9090
 _MAX_MESSAGE = 8 << 20
 """A raw picture with 1920 x 1080 pixels has 8.3 MB as Base64 [bytes]."""
@@ -100,7 +105,15 @@ class RosbridgeChannel:
             self._socket.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """See ``Channel``."""
+        """See ``Channel``. What the other end has not received is discarded.
+
+        Otherwise the kernel would deliver it minutes later, when the network works again, and the robot would move.
+        """
+        end_s = time.monotonic() + _DELIVERY_S
+        while unreceived(self._socket) and time.monotonic() < end_s:
+            time.sleep(_DELIVERY_S / 20)
+        if unreceived(self._socket):
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._socket.close()
 
     def _shake_hands(self, connected: socket.socket) -> None:
@@ -148,3 +161,10 @@ def _trust(certificate_authority: str) -> ssl.SSLContext:
         raise UnreachableError(
             f"option 'certificate_authority': {certificate_authority} contains no certificates: {error}"
         ) from error
+
+
+def unreceived(opened: socket.socket | TlsSocket) -> int:
+    """Bytes that the kernel keeps because the other end has not acknowledged them; 0 if it has ended."""
+    with contextlib.suppress(OSError):
+        return int.from_bytes(fcntl.ioctl(opened, termios.TIOCOUTQ, bytes(4)), "little")
+    return 0

@@ -26,6 +26,8 @@ WATCHDOG_S = 0.3
 """Longest time between two velocities of a base [s]."""
 _CHECK_S = 0.05
 _MASTER_S = 0.5
+_SUBSCRIBER_S = 3.0
+"""Time until a topic has a subscriber after its first message [s]."""
 _MASTER_TIMEOUT_S = 2.0
 _BRAKE_S = 0.1
 _MAX_LINE = 1 << 20
@@ -39,20 +41,24 @@ class Bridge:
         link: Socket to the agent.
         rospy: The library. It is imported after its folders are known.
         genpy: The library of its messages.
+        needs_subscribers: Whether the process ends when a topic that it publishes has no subscriber.
     """
 
-    def __init__(self, link: socket.socket, rospy: Any, genpy: Any) -> None:
+    def __init__(self, link: socket.socket, rospy: Any, genpy: Any, *, needs_subscribers: bool) -> None:
         self._link = link
         self._rospy = rospy
         self._genpy = genpy
+        self._needs_subscribers = needs_subscribers
         self._sending = threading.Lock()
         self._publishers: dict[str, Any] = {}
+        self._subscribed: set[str] = set()
+        self._first_s: dict[str, float] = {}
         self._driven_s: dict[str, float] = {}
         self._forwarded_s: dict[str, float] = {}
 
     def run(self) -> None:
         """Execute operations until the agent's side closes; then brake."""
-        threading.Thread(target=self._watch_base, daemon=True).start()
+        threading.Thread(target=self._watch, daemon=True).start()
         lines = self._link.makefile("rb")
         for line in iter(lambda: lines.readline(_MAX_LINE), b""):
             try:
@@ -83,6 +89,7 @@ class Bridge:
         self._genpy.message.fill_message_args(message, [values])
         if "header" in message.__slots__ and "header" not in values:
             message.header.stamp = self._rospy.Time.now()
+        self._first_s.setdefault(topic, time.monotonic())
         if publisher.type in _VELOCITIES:
             self._driven_s[topic] = time.monotonic()
         publisher.publish(message)
@@ -103,10 +110,24 @@ class Bridge:
         except OSError:
             return  # the main thread notices it too
 
-    def _watch_base(self) -> None:
+    def _watch(self) -> None:
         while True:
             time.sleep(_CHECK_S)
             self._brake(newest_s=time.monotonic() - WATCHDOG_S)
+            if self._needs_subscribers:
+                self._check_subscribers()
+
+    def _check_subscribers(self) -> None:
+        for topic, publisher in list(self._publishers.items()):
+            if publisher.get_num_connections():
+                self._subscribed.add(topic)
+            elif topic in self._subscribed or self._is_unheard(topic):
+                self.report("error", f"{topic} has no subscriber; check the robot's controllers")
+                os._exit(1)
+
+    def _is_unheard(self, topic: str) -> bool:
+        """Whether no subscriber has connected since the first message. ``rospy`` does not try again."""
+        return time.monotonic() - self._first_s.get(topic, math.inf) > _SUBSCRIBER_S
 
     def _brake(self, *, newest_s: float) -> None:
         """Publish zero on each topic whose last velocity is older than this time [s]."""
@@ -166,8 +187,11 @@ def watch_master(bridge: Bridge, address: str, first: int) -> None:
 
 
 def main() -> None:
-    """Arguments: name of the node, address of the master, folders of ROS's Python packages."""
-    name, master, *folders = sys.argv[1:]
+    """Arguments: name of the node, address of the master, needs_subscribers, folders of ROS's Python packages.
+
+    ``needs_subscribers`` is empty if topics may have no subscriber.
+    """
+    name, master, needs_subscribers, *folders = sys.argv[1:]
     sys.path[:0] = folders
     link = socket.socket(fileno=os.dup(0))
 
@@ -187,7 +211,7 @@ def main() -> None:
         rospy.init_node(name, anonymous=True, disable_signals=True)
     except Exception as error:  # noqa: BLE001 (as above)
         fail(f"rospy cannot be used: {type(error).__name__}: {error}")
-    bridge = Bridge(link, rospy, genpy)
+    bridge = Bridge(link, rospy, genpy, needs_subscribers=bool(needs_subscribers))
     threading.Thread(target=watch_master, args=(bridge, master, first), daemon=True).start()
     bridge.report("none", "ready")
     bridge.run()

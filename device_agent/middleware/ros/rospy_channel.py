@@ -27,14 +27,18 @@ class RospyChannel(BridgeProcess):
         folders: Folders of ROS's Python packages; empty if the interpreter finds them.
         master: Address of the ROS master: ``http://robot:11311``.
         node: Name of the node; ROS appends a number.
+        needs_subscribers: Whether the channel is lost when a topic that it publishes has no subscriber. Commands
+            of a robot need one.
 
     Raises:
         UnreachableError: The bridge cannot be started, or there is no master.
     """
 
-    def __init__(self, *, python: str, folders: Sequence[str], master: str, node: str) -> None:
+    def __init__(
+        self, *, python: str, folders: Sequence[str], master: str, node: str, needs_subscribers: bool = True
+    ) -> None:
         self.where = f"ROS at {master}"
-        super().__init__("ROS bridge", python, _BRIDGE, node, master, *folders)
+        super().__init__("ROS bridge", python, _BRIDGE, node, master, "1" if needs_subscribers else "", *folders)
         try:
             self._wait_until_ready()
         except (OSError, msgspec.MsgspecError) as error:

@@ -54,6 +54,10 @@ class TlsSocket:
                     raise BlockingIOError from error
         return b"".join(parts)
 
+    def setsockopt(self, level: int, option: int, value: bytes) -> None:
+        """Set an option of the socket."""
+        self._socket.setsockopt(level, option, value)
+
     def shutdown(self, how: int) -> None:
         """End the connection at once; calls of other threads then fail."""
         socket.socket.shutdown(self._socket, how)

@@ -1,4 +1,4 @@
-"""An operator in Chromium with a simulated robot; the simulation trace is the measurement."""
+"""An operator in Chromium with an arm; its trace is the measurement."""
 
 import contextlib
 import json
@@ -11,6 +11,7 @@ from playwright.sync_api import Browser, Page, Playwright, expect
 
 from tests.harness.browser.browser import FLAT
 from tests.harness.browser.product import Machine
+from tests.harness.browser.robots import Robot
 from tests.harness.browser.steering import (
     assert_at_rest,
     commanded_speed,
@@ -27,9 +28,9 @@ from tests.harness.browser.steering import (
 from tests.harness.network.brokers import wait_until
 
 
-def test_the_elbow_slider_works_only_for_the_operator_in_control(browser: Browser, machine: Machine) -> None:
-    trace = machine.trace()
-    with operator(browser, machine) as ann, operator(browser, machine) as bob:
+def test_the_elbow_slider_works_only_for_the_operator_in_control(browser: Browser, arm: Robot) -> None:
+    trace = arm.trace
+    with operator(browser, arm.machine, arm.label) as ann, operator(browser, arm.machine, arm.label) as bob:
         expect(ann.get_by_test_id("online")).to_contain_text("online", ignore_case=True)
         before = elbow(trace)
         slider = ann.get_by_test_id("slider-elbow")
@@ -50,15 +51,16 @@ def test_the_elbow_slider_works_only_for_the_operator_in_control(browser: Browse
         rest = elbow(trace)
         expect(bob.get_by_test_id("request-control")).to_be_visible()
         expect(bob.get_by_test_id("take-control")).to_have_count(0)
-        assert_not_moved_by_force(bob)
+        assert_not_moved_by_force(bob, arm)
         assert abs(elbow(trace) - rest) < 0.005
         ann.get_by_test_id("release-control").click()
         expect(ann.get_by_test_id("control-state")).not_to_have_attribute("data-state", "mine")
 
 
-def assert_not_moved_by_force(page: Page) -> None:
+def assert_not_moved_by_force(page: Page, arm: Robot) -> None:
     """Direct requests of a page without the lease get no credentials and no action."""
-    device = page.evaluate("() => fetch('/api/v1/devices').then(r => r.json())")["items"][0]
+    devices = page.evaluate("() => fetch('/api/v1/devices').then(r => r.json())")["items"]
+    (device,) = [each for each in devices if each["name"] == arm.name]
     csrf = page.evaluate("() => fetch('/api/v1/accounts/me').then(r => r.json())")["csrf_token"]
     post = """([path, body, csrf]) => fetch('/api/v1' + path, {method: 'POST', body: JSON.stringify(body),
         headers: {'Content-Type': 'application/json', 'X-CSRF-Token': csrf}}).then(r => r.status)"""
@@ -70,9 +72,9 @@ def assert_not_moved_by_force(page: Page) -> None:
         assert page.evaluate(post, [f"/devices/{device['id']}/actions", body, csrf]) == 409
 
 
-def test_stop_latches_until_it_is_reset(browser: Browser, machine: Machine) -> None:
-    trace = machine.trace()
-    with operator(browser, machine) as page:
+def test_stop_latches_until_it_is_reset(browser: Browser, arm: Robot) -> None:
+    trace = arm.trace
+    with operator(browser, arm.machine, arm.label) as page:
         drive(page, 0.25, lambda: commanded_speed(trace) > 0.1, "motion")
         page.keyboard.press("Escape")
         expect(page.get_by_test_id("stop-banner")).to_be_visible()
@@ -104,9 +106,9 @@ def test_the_view_the_plot_and_the_pose_table_are_updated(drawing_browser: Brows
         assert rows.count() >= 6
 
 
-def test_a_movement_runs_from_the_list(browser: Browser, machine: Machine) -> None:
-    trace = machine.trace()
-    with operator(browser, machine) as page:
+def test_a_movement_runs_from_the_list(browser: Browser, arm: Robot) -> None:
+    trace = arm.trace
+    with operator(browser, arm.machine, arm.label) as page:
         page.get_by_test_id("movement-home").click()
         status = page.get_by_test_id("action-status")
         expect(status).to_have_attribute("data-status", "done")

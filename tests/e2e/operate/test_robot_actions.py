@@ -9,6 +9,7 @@ from playwright.sync_api import Browser, Page, expect
 from tests.harness.browser.browser import pages
 from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Machine
+from tests.harness.browser.robots import Robot
 from tests.harness.network.brokers import wait_until
 
 STEPS = ("accepted", "started", "observed", "ended")
@@ -48,21 +49,21 @@ def frame(page: Page, row: int) -> list[float]:
     return [float(number) for number in (cell.text_content() or "").split()]
 
 
-def joint(machine: Machine, device: str, name: str) -> float:
-    """Measured position in the simulation [rad]."""
-    return float(machine.trace(device).now()["qpos"][name])
+def joint(robot: Robot, name: str) -> float:
+    """True position [rad]."""
+    return float(robot.trace.now()["qpos"][name])
 
 
-def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine) -> None:
-    with pages(browser, laboratory) as (page,):
-        open_robot(page, laboratory, "ur5")
+def test_the_arm_moves_to_a_pose_and_back(browser: Browser, arm: Robot) -> None:
+    with pages(browser, arm.machine) as (page,):
+        open_robot(page, arm.machine, arm.name)
         height = page.get_by_test_id("pose-2")
         wait_until(lambda: height.input_value() != "", "the pose to be filled in")
-        before = {name: joint(laboratory, "ur5", name) for name in ("shoulder_lift", "elbow", "wrist_1")}
+        before = {name: joint(arm, name) for name in ("shoulder_lift", "elbow", "wrist_1")}
         height.fill(f"{float(height.input_value()) - 0.08:.3f}")
         press(page, "pose-go")
         assert_done(page, "move_pose")
-        assert abs(joint(laboratory, "ur5", "elbow") - before["elbow"]) > 0.02
+        assert abs(joint(arm, "elbow") - before["elbow"]) > 0.02
         # By the Denavit-Hartenberg convention, the second joint is at the frame of the first.
         position_m = frame(page, 0)
         page.get_by_text("All joints", exact=True).click()
@@ -74,7 +75,7 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
         press(page, "undo-action")
         assert_done(page, "move_joints")
         for name, was in before.items():
-            assert joint(laboratory, "ur5", name) == pytest.approx(was, abs=0.02), name
+            assert joint(arm, name) == pytest.approx(was, abs=0.02), name
 
         # An impossible pose is rejected with the robot's reason.
         height.fill("3")
@@ -86,18 +87,18 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
 
 
 def test_the_humanoid_assumes_a_posture_runs_a_behaviour_and_reduces_stiffness(
-    browser: Browser, laboratory: Machine
+    browser: Browser, humanoid: Robot
 ) -> None:
-    with pages(browser, laboratory) as (page,):
-        open_robot(page, laboratory, "nao")
-        knee = joint(laboratory, "nao", "LKneePitch")
+    with pages(browser, humanoid.machine) as (page,):
+        open_robot(page, humanoid.machine, humanoid.name)
+        knee = joint(humanoid, "LKneePitch")
         press(page, "posture-Crouch")
         expect(page.get_by_test_id("behaviour-Hello")).to_be_disabled()
         assert_done(page, "take_posture")
-        assert abs(joint(laboratory, "nao", "LKneePitch") - knee) > 0.2
+        assert abs(joint(humanoid, "LKneePitch") - knee) > 0.2
         press(page, "undo-action")
         assert_done(page, "move_joints")
-        assert joint(laboratory, "nao", "LKneePitch") == pytest.approx(knee, abs=0.1)
+        assert joint(humanoid, "LKneePitch") == pytest.approx(knee, abs=0.1)
 
         press(page, "behaviour-Hello")
         expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "started")
@@ -160,7 +161,7 @@ def test_the_head_shows_an_expression_and_says_a_sentence(browser: Browser, labo
         page.get_by_test_id("strength").fill("0.8")
         press(page, "expression-happy")
         assert_done(page, "express")
-        assert abs(joint(laboratory, "hanson", "Smile-L")) > 0.02
+        assert abs(laboratory.trace("hanson").now()["qpos"]["Smile-L"]) > 0.02
 
         open_robot(other, laboratory, "hanson")
         other.get_by_test_id("say-text").fill("This waits.")

@@ -40,6 +40,9 @@ FILES = {
     "_helper.py": "",
 }
 
+CLOCK = "import time\nread = time.time\ntime.time = lambda: read() + {}\n"
+"""Module that Python imports at its start: a wrong clock of the robot."""
+
 
 class LegacyRobot:
     """A robot of Anna.
@@ -47,6 +50,7 @@ class LegacyRobot:
     Attributes:
         movements: Folder of its movements.
         device: Id of its device, after ``pair``.
+        clock_offset_s: Error of its clock [s], for programs that start afterwards.
     """
 
     def __init__(self, processes: CloudProcesses, python: str, folder: Path) -> None:
@@ -58,6 +62,8 @@ class LegacyRobot:
             (self.movements / name).write_text(text)
         self.device = self.agent = ""
         self.url = processes.url
+        self.clock_offset_s = 0
+        self._clock = folder / "clock"
         self._python = python
         self._programs = contextlib.ExitStack()
         self._program: Program | None = None
@@ -65,7 +71,9 @@ class LegacyRobot:
     def start(self, *arguments: str, program: Path = WRAPPER) -> Program:
         """Start the wrapper, or a program that uses it."""
         command = [str(program), *arguments]
-        environment = {**environment_of({}), "PYTHONPATH": str(WRAPPER.parent)}
+        self._clock.mkdir(exist_ok=True)
+        (self._clock / "sitecustomize.py").write_text(CLOCK.format(self.clock_offset_s))
+        environment = {**environment_of({}), "PYTHONPATH": f"{self._clock}{os.pathsep}{WRAPPER.parent}"}
         self._program = self._programs.enter_context(start_program(command, environment, python=self._python))
         return self._program
 

@@ -22,7 +22,7 @@ from tests.harness.hosts.host import interpreter
 from tests.harness.network.brokers import wait_until
 from tests.harness.network.proxy import start_proxy
 
-OLDEST, NEW = "3.6", "3.12"
+OLDEST, NEW = "3.6", "3.13"
 
 
 @pytest.fixture
@@ -116,6 +116,38 @@ def test_a_movement_ends_with_a_killed_wrapper_and_never_runs_again(robot: Legac
     assert (ended["status"], ended["reason"]["code"]) == ("failed", "agent_restarted")
     assert robot.end(robot.begin("wave")["id"])["status"] == "done"
     assert robot.walks() == walks
+
+
+@pytest.mark.parametrize("offset_s", [3600, -3600])
+def test_a_wrong_clock_of_the_robot_changes_nothing(robot: LegacyRobot, offset_s: int) -> None:
+    robot.clock_offset_s = offset_s
+    robot.run("--report-every", "0.1")
+    assert robot.end(robot.begin("wave")["id"])["status"] == "done", robot.log()
+    now_ms = robot.processes.cloud.clock.now_ms()
+    walk = RunBehaviour(name="walk")
+    robot.deliver(robot.command(walk, id="expired-1", issued_at_ms=now_ms - 60_000))
+    wait_until(lambda: robot.last_ack("expired-1") == ("expired", "expired"), "the expired command")
+    robot.deliver(robot.command(walk, id="future-1", issued_at_ms=now_ms + 600_000))
+    wait_until(lambda: robot.last_ack("future-1") == ("failed", "from_the_future"), "the command of the future")
+    assert robot.walks() == []
+    wait_until(lambda: robot.anna.get(f"/devices/{robot.device}/latency").json()["items"], "response times")
+
+    action = robot.begin_walk()
+    robot.kill()
+    wait_until(lambda: not robot.walking(), "the end of the movement")
+    walks = robot.walks()
+    robot.clock_offset_s = -offset_s  # a robot without a clock of its own starts with another time
+    robot.run("--lost-after", "1")
+    assert robot.end(action)["reason"]["code"] == "agent_restarted"
+    assert robot.end(robot.begin("wave")["id"])["status"] == "done", robot.log()
+    assert robot.walks() == walks
+
+    action = robot.begin_walk()
+    server = robot.processes.endpoints["server"]
+    server.kill()
+    wait_until(lambda: not robot.walking(), "the end of the movement")
+    server.revive()
+    assert robot.end(action)["reason"]["code"] == "link_lost"
 
 
 def test_a_movement_whose_guard_is_killed_has_failed(robot: LegacyRobot) -> None:

@@ -111,7 +111,7 @@ def robot(cloud: LegacyCloud, tmp_path: Path) -> Iterator[RunningRobot]:
         yield robot
 
 
-@pytest.mark.parametrize("version", ["3.6", "3.12"])
+@pytest.mark.parametrize("version", ["3.6", "3.13"])
 def test_signed_forged_repeated_and_expired_commands(cloud: LegacyCloud, tmp_path: Path, version: str) -> None:
     python = interpreter(version)
     (tmp_path / "step.py").write_text("open('steps', 'a').write('step\\n')\n")

@@ -157,7 +157,7 @@ def test_the_grammar_is_that_of_python_3_6() -> None:
     ast.parse(WRAPPER.read_text(encoding="utf-8"), feature_version=(3, 6))
 
 
-@pytest.mark.parametrize("version", ["3.6", "3.12"])
+@pytest.mark.parametrize("version", ["3.6", "3.13"])
 def test_other_versions_of_python_agree(version: str) -> None:
     python = interpreter(version)
     program = (

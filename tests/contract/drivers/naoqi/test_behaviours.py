@@ -108,6 +108,7 @@ def test_a_halt_and_a_hung_agent_end_a_behaviour(agent: ControlThread, nao: NaoP
 
 
 def test_a_behaviour_of_a_killed_bridge_is_ended_by_the_next_one(agent: ControlThread, nao: NaoPeer) -> None:
+    nao.end_watchdog()
     thread, errors = agent.start(WALK)
     until(lambda: any(nao.state()["twist"]))
     assert agent.driver._connection is not None
@@ -117,6 +118,22 @@ def test_a_behaviour_of_a_killed_bridge_is_ended_by_the_next_one(agent: ControlT
     assert any(nao.state()["twist"]), "NAOqi continues alone"
     agent.driver.connect()
     until(lambda: holds(nao))
+
+
+def test_the_watchdog_on_the_robot_ends_the_walk_of_a_behaviour(agent: ControlThread, nao: NaoPeer) -> None:
+    thread, errors = agent.start(WALK)
+    until(lambda: any(nao.state()["twist"]))
+    time.sleep(0.3)
+    assert any(nao.state()["twist"]), "it does not disturb a behaviour while the bridge works"
+    assert agent.driver._connection is not None
+    agent.driver._connection._bridge.process.kill()
+    thread.join()
+    assert "lost" in errors[0]
+    until(lambda: not any(nao.state()["twist"]))
+    assert nao.state()["running"], "only the next bridge ends the behaviour"
+    agent.driver.connect()
+    until(lambda: holds(nao))
+    assert not nao.state()["running"]
 
 
 def test_a_behaviour_that_the_robot_does_not_end_halts_the_device(

@@ -155,6 +155,37 @@ def test_an_ended_bridge_is_a_lost_device_and_reconnecting_stops_the_walk(driver
     until(lambda: not any(peer.state()["twist"]))
 
 
+def test_the_robot_stops_by_itself_without_the_bridge(driver: NaoqiDriver, peer: NaoPeer) -> None:
+    assert driver._connection is not None
+    until(lambda: walks(driver, peer))
+    driver._connection._bridge.process.kill()
+    until(lambda: not any(peer.state()["twist"]))
+
+
+def test_a_robot_walks_only_while_its_watchdog_runs(driver: NaoqiDriver, peer: NaoPeer) -> None:
+    until(lambda: walks(driver, peer))
+    peer.end_watchdog()
+    until(lambda: not any(peer.state()["twist"]))
+    until(driver.faults)
+    assert [(fault.code, fault.stops) for fault in driver.faults()] == [("no-watchdog", False)]
+    assert driver.drive(WALK) == REST
+    driver.connect()
+    assert [fault.code for fault in driver.faults()] == ["no-watchdog"], "an old echo is none"
+    assert driver.drive(WALK) == REST
+    peer.start_watchdog()
+    until(lambda: not driver.faults())
+    until(lambda: walks(driver, peer))
+
+
+def test_an_orderly_end_releases_the_watchdog(driver: NaoqiDriver, peer: NaoPeer) -> None:
+    until(lambda: walks(driver, peer))
+    driver.close()
+    until(lambda: not any(peer.state()["twist"]))
+    peer.state(set={"walk": list(WALK)})
+    time.sleep(0.5)
+    assert any(peer.state()["twist"]), "another program may move the robot"
+
+
 def test_a_hung_bridge_is_a_lost_device_and_is_replaced(driver: NaoqiDriver, peer: NaoPeer) -> None:
     assert driver._connection is not None
     process = driver._connection._bridge.process

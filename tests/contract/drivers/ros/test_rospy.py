@@ -220,6 +220,44 @@ def test_the_bridge_brakes_a_base_when_the_agent_ends(system: RosSystem) -> None
     watching.close()
 
 
+def connect(system: RosSystem, *, subscriptions: list[Subscription], needs_subscribers: bool) -> Connection:
+    return Connection(
+        RospyChannel(python=PYTHON, folders=(), master=system.uri, node="x", needs_subscribers=needs_subscribers),
+        subscriptions=subscriptions,
+        advertised={} if subscriptions else {"/heard": "std_msgs/Bool"},
+        device="test",
+        clock=time.monotonic,
+    )
+
+
+def test_the_loss_of_the_last_subscriber_ends_only_a_channel_that_needs_one(system: RosSystem) -> None:
+    received: list[bool] = []
+    heard = Subscription("/heard", "std_msgs/Bool", dict[str, bool], lambda bit, _: received.append(bit["data"]))
+    listener = connect(system, subscriptions=[heard], needs_subscribers=False)
+    robot = connect(system, subscriptions=[], needs_subscribers=True)
+    display = connect(system, subscriptions=[], needs_subscribers=False)
+
+    def both_arrive() -> bool:
+        robot.publish(Publication("/heard", {"data": True}))
+        display.publish(Publication("/heard", {"data": False}))
+        return {True, False} <= set(received)
+
+    until_often(both_arrive)
+    listener.close()
+    until_often(lambda: robot.lost)
+    assert "/heard has no subscriber" in robot.problem
+    received.clear()
+    listener = connect(system, subscriptions=[heard], needs_subscribers=False)
+
+    def arrives() -> bool:
+        display.publish(Publication("/heard", {"data": False}))
+        return bool(received)
+
+    until_often(arrives)
+    for connection in (listener, robot, display):
+        connection.close()
+
+
 def test_messages_that_are_not_installed_are_reported(system: RosSystem, robot: RosRobot) -> None:
     del robot
     driver = create(system, safety=[{"topic": "/mode", "type": "no_msgs/Mode", "field": "mode", "normal": [1]}])

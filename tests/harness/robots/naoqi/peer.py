@@ -1,4 +1,4 @@
-"""A NAO for tests: the process that hosts NAOqi's services."""
+"""A NAO for tests: the process that hosts NAOqi's services, and the program that it starts beside itself."""
 
 import json
 import subprocess
@@ -13,6 +13,7 @@ from device_agent.protocol.manifests.robot_type import RobotType
 from tests.harness.paths import ROOT
 
 _SERVICES = Path(__file__).with_name("services.py")
+_WATCHDOG = ROOT / "examples" / "nao" / "telescope_watchdog.py"
 _SIMULATED = "tests.harness.robots.naoqi.simulated_nao"
 
 
@@ -23,9 +24,10 @@ class NaoPeer:
         robot_type: Joints and limits.
         python: Interpreter that has ``qi``.
         simulated: Whether the joints are those of the simulation, instead of a simple model.
+        watchdog: Whether the program for the robot is installed.
     """
 
-    def __init__(self, robot_type: RobotType, python: Path, *, simulated: bool = False) -> None:
+    def __init__(self, robot_type: RobotType, python: Path, *, simulated: bool = False, watchdog: bool = True) -> None:
         self._names = [joint.name for joint in robot_type.joints]
         self._lock = threading.Lock()
         self._python = python
@@ -39,6 +41,26 @@ class NaoPeer:
             "home": [robot_type.home_rad[name] for name in self._names],
         }
         self.url: str = self._exchange(config)
+        self.watchdog: subprocess.Popen[str] | None = None
+        if watchdog:
+            self.start_watchdog()
+
+    def start_watchdog(self) -> None:
+        """Start the program for the robot, as NAOqi does."""
+        self.watchdog = subprocess.Popen(
+            [self._python, "-I", _WATCHDOG, self.url], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
+        assert self.watchdog.stdout is not None
+        assert "ready\n" in iter(self.watchdog.stdout.readline, "")  # after lines of the library
+
+    def end_watchdog(self) -> None:
+        """End that program."""
+        watchdog, self.watchdog = self.watchdog, None
+        if watchdog is not None:
+            assert watchdog.stdout is not None
+            watchdog.kill()
+            watchdog.wait()
+            watchdog.stdout.close()
 
     def options(self) -> dict[str, str]:
         """Options of a driver for this robot."""
@@ -70,6 +92,9 @@ class NaoPeer:
     def restore(self) -> None:
         """See ``Peer``."""
         self.state(restore=True)
+        if self.watchdog is not None and self.watchdog.poll() is not None:  # it has ended with NAOqi
+            self.end_watchdog()
+            self.start_watchdog()
 
     def close(self) -> None:
         """Switch the robot off."""
@@ -79,6 +104,7 @@ class NaoPeer:
         self.process.stdout.close()
         self.process.kill()
         self.process.wait()
+        self.end_watchdog()
 
     def _exchange(self, request: Any) -> Any:
         assert self.process.stdin is not None

@@ -4,6 +4,7 @@ It prints its address, then answers each JSON line on its standard input with on
 ``answer``. Joints move at a constant speed. A walk lasts until it is stopped.
 """
 
+import collections
 import json
 import math
 import sys
@@ -43,6 +44,9 @@ class Body:
         self.spoken, self.calls, self.language = [], [], "English"
         self.speaking = threading.Event()
         self.running, self.stubborn = [], False
+        self.memory: dict[str, int] = {}
+        self.checks: collections.deque[float] = collections.deque(maxlen=400)
+        self.inserted_s = 0.0
         self.disturbance, self.old_ms = "", 0
         self.rest_s: float | None = time.monotonic()
         threading.Thread(target=self.run, daemon=True).start()
@@ -177,7 +181,17 @@ class ALMemory:
             return self.body.old_ms if self.body.disturbance == "clock" else int(time.monotonic() * 1000)
         if key == "robotHasFallen":
             return 1.0 if self.body.fallen else 0.0
+        if key == "Telescope/Beat":
+            with self.body.lock:
+                self.body.checks.append(time.monotonic())
+        if key in self.body.memory:
+            return self.body.memory[key]
         raise RuntimeError(f"no data '{key}'")
+
+    def insertData(self, key, value):
+        with self.body.lock:
+            self.body.memory[key] = value
+            self.body.inserted_s = time.monotonic() if key == "Telescope/Beat" else self.body.inserted_s
 
     def getListData(self, keys):
         return [float(30 + self.body.joints.index(key.split("/")[2])) for key in keys]
@@ -303,7 +317,9 @@ class Nao:
                 "target",
                 "velocity",
                 "twist",
+                "pose",
                 "rest_s",
+                "inserted_s",
                 "stiffness",
                 "fraction",
                 "spoken",
@@ -311,7 +327,7 @@ class Nao:
                 "language",
                 "running",
             )
-            return {name: getattr(body, name) for name in state}
+            return {name: getattr(body, name) for name in state} | {"checks": list(body.checks)}
 
 
 def main(body):

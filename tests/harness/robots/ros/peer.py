@@ -3,7 +3,8 @@
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from device_agent.drivers.testing.peer import Disturbance
@@ -30,6 +31,9 @@ class RosPeer:
         kind: Kind of the command topic, as in the driver's options.
         stamped: Whether the velocity of the base is a TwistStamped.
         split: Whether the joints have two controllers.
+        suffix: Suffix of the joints' names.
+        renamed: Other names of topics.
+        types: Other types of topics, by their names at the server.
     """
 
     def __init__(
@@ -40,12 +44,18 @@ class RosPeer:
         kind: str = "trajectory",
         stamped: bool = False,
         split: bool = False,
+        suffix: str = "_joint",
+        renamed: Mapping[str, str] = MappingProxyType({}),
+        types: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self._split = split
         self._type, self._ros, self._kind, self._stamped = robot_type, ros, kind, stamped
         self._lock = threading.Lock()
-        self.robot = Robot(robot_type, ros=ros, kind=kind, stamped=stamped, split=split)
-        self.server = RosbridgeServer(self.robot.types(), self._receive, ros, self._receive_goal)
+        self._renamed = renamed
+        self._original = {name: topic for topic, name in renamed.items()}
+        self.robot = Robot(robot_type, ros=ros, kind=kind, stamped=stamped, split=split, suffix=suffix)
+        known = {renamed.get(topic, topic): kind for topic, kind in self.robot.types().items()}
+        self.server = RosbridgeServer({**known, **types}, self._receive, ros, self._receive_goal)
         self.server.actions[topics.ACTION] = "control_msgs/action/FollowJointTrajectory"
         self.server.latched[topics.SAFETY] = {"data": False}
         self._disturbance: Disturbance | None = None
@@ -152,7 +162,7 @@ class RosPeer:
 
     def _receive(self, topic: str, message: Any) -> None:
         try:
-            self.robot.receive(topic, message)
+            self.robot.receive(self._original.get(topic, topic), message)
         except RejectedError as error:
             self.robot.rejected.append(str(error))
 
@@ -181,20 +191,23 @@ class RosPeer:
         message = robot.joint_state(stamp_ns, robot.names[::-1] if kind is Disturbance.ORDER else robot.names)
         if kind is Disturbance.NAN:
             message["position"] = [float("nan")] * len(message["position"])
-        self.server.publish(topics.JOINT_STATES, message, self._corrupt)
+        self._send(topics.JOINT_STATES, message, self._corrupt)
         for result in robot.results():
             if self._ros == 1:
-                self.server.publish(f"{topics.ACTION}/result", result, self._corrupt)
+                self._send(f"{topics.ACTION}/result", result, self._corrupt)
             else:
                 self.server.send_result(result)
         if self._cycles % _SLOW:
             return
-        self.server.publish(f"{topics.ACTION}/status", robot.status(), self._corrupt)
-        self.server.publish(topics.DIAGNOSTICS, robot.diagnostics(), self._corrupt)
-        self.server.publish(topics.BATTERY, robot.battery(), self._corrupt)
-        self.server.publish(topics.ODOMETRY, robot.odometry(), self._corrupt)
-        self.server.publish(topics.PICTURES, robot.picture(), self._corrupt)
-        self.server.publish(topics.TF, robot.transforms(), self._corrupt)
+        self._send(f"{topics.ACTION}/status", robot.status(), self._corrupt)
+        self._send(topics.DIAGNOSTICS, robot.diagnostics(), self._corrupt)
+        self._send(topics.BATTERY, robot.battery(), self._corrupt)
+        self._send(topics.ODOMETRY, robot.odometry(), self._corrupt)
+        self._send(topics.PICTURES, robot.picture(), self._corrupt)
+        self._send(topics.TF, robot.transforms(), self._corrupt)
+
+    def _send(self, topic: str, message: Any, corrupt: Callable[[bytes], bytes | None]) -> None:
+        self.server.publish(self._renamed.get(topic, topic), message, corrupt)
 
     def _corrupt(self, data: bytes) -> bytes | None:
         if self._disturbance is Disturbance.SILENCE:

@@ -31,17 +31,17 @@ _ROS2 = {"succeeded": 4, "preempted": 5, "aborted": 6}
 
 
 class Robot:
-    """Joints, base, and the messages of both. Its joints have the names of the type with the suffix ``_joint``.
+    """Joints, base, and the messages of both. Its joints have the names of the type with a suffix.
 
     Attributes:
         stopped: Whether it has stopped itself. It then ignores commands.
         rejected: Commands that a controller did not accept.
     """
 
-    def __init__(self, robot_type: RobotType, *, ros: int, kind: str, stamped: bool, split: bool) -> None:
+    def __init__(self, robot_type: RobotType, *, ros: int, kind: str, stamped: bool, split: bool, suffix: str) -> None:
         self._split = split
         self._ros, self._kind, self._stamped = ros, kind, stamped
-        self.names = [f"{joint.name}_joint" for joint in robot_type.joints]
+        self.names = [f"{joint.name}{suffix}" for joint in robot_type.joints]
         home = [robot_type.home_rad[joint.name] for joint in robot_type.joints]
         self.joints = JointController(dict(zip(self.names, home, strict=True)))
         self.action = TrajectoryAction(self.joints)

@@ -2,14 +2,17 @@
 
 Its controllers are those of the emulated robot (the file ``CONTROLLERS``); ``MESSAGES`` is a folder with the package
 ``control_msgs``. Its action server is that of ``actionlib``. Each line of standard input is a JSON object with one of
-the requests ``disturb``, ``restore``, ``reset`` and ``abort``, or none. The answer is the robot's state: positions
-and velocities by joint, the true speed of the base, counters, and times in seconds.
+the requests ``disturb``, ``restore``, ``reset``, ``abort``, ``silent`` and ``cut``, or none. ``cut`` closes the TCP
+connections of the topics of joints and base. The answer is the robot's state: positions and velocities by joint, the
+true speed of the base, counters, and times in seconds.
 """
 
+import contextlib
 import importlib.machinery
 import json
 import math
 import os
+import socket
 import sys
 import threading
 import time
@@ -56,7 +59,7 @@ class Robot:
     def __init__(self, controllers, home):
         self._controllers, self._home = controllers, home
         self._lock = threading.RLock()
-        self._command_s = self._rest_s = 0.0
+        self._command_s = self._rest_s = self._cut_s = 0.0
         self._commands = 0
         self._disturbance = ""
         self._stopped = False
@@ -67,8 +70,13 @@ class Robot:
         self._odometry = rospy.Publisher("/odom", Odometry, queue_size=1)
         self._stop = rospy.Publisher("/emergency_stop", Bool, queue_size=1, latch=True)
         self._stop.publish(Bool(False))
-        rospy.Subscriber("/arm_controller/command", JointTrajectory, self.follow, queue_size=1, tcp_nodelay=True)
-        rospy.Subscriber("/cmd_vel", Twist, self.drive, queue_size=1, tcp_nodelay=True)
+        command, velocity = "/arm_controller/command", "/cmd_vel"
+        self._topics = [
+            self._states,
+            self._odometry,
+            rospy.Subscriber(command, JointTrajectory, self.follow, queue_size=1, tcp_nodelay=True),
+            rospy.Subscriber(velocity, Twist, self.drive, queue_size=1, tcp_nodelay=True),
+        ]
         messages = importlib.import_module("control_msgs.msg")
         self._result = messages.FollowJointTrajectoryResult
         self._server = actionlib.ActionServer(
@@ -134,6 +142,15 @@ class Robot:
                 self.action.abort(-4, request["abort"])
             if "silent" in request:
                 self.action.silent = request["silent"]
+            if "cut" in request:
+                self._cut()
+
+    def _cut(self):
+        for topic in self._topics:
+            for connection in list(topic.impl.connections):
+                with contextlib.suppress(OSError, AttributeError):  # it has ended already
+                    connection.socket.shutdown(socket.SHUT_RDWR)
+        self._cut_s = self.joints.time_s
 
     def _set_stop(self, stopped):
         if stopped != self._stopped:
@@ -209,6 +226,7 @@ class Robot:
                 "time_s": self.joints.time_s,
                 "command_s": self._command_s,
                 "moved_s": self._rest_s,
+                "cut_s": self._cut_s,
             }
 
 

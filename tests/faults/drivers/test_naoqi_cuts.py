@@ -24,7 +24,7 @@ PERIOD_S = 0.02
 AGENT = """
 import json, sys, time
 from device_agent.ports.driver import Twist
-from tests.faults.test_naoqi_cuts import make_driver, start_motion
+from tests.faults.drivers.test_naoqi_cuts import make_driver, start_motion
 driver = make_driver(json.loads(sys.argv[1]))
 driver.connect()
 start_motion(driver, lambda: False)
