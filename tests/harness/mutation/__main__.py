@@ -1,6 +1,6 @@
 """Tests mutants: ``python -m tests.harness.mutation [--sample N] [--seed TEXT] [--workers N] [--page] [package …]``.
 
-Exits with 1 if a package's score is too low, or a mutant survived that is not in ``survivors.toml``.
+Exits with 1 if a package's score is too low, or a mutant survived that is not in ``survivors``.
 """
 
 import argparse

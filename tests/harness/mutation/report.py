@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-LISTED: Final = Path(__file__).with_name("survivors.toml")
+LISTED: Final = Path(__file__).with_name("survivors")
+"""Folder with one file for each package."""
 REQUIRED: Final = 0.9
 """Share of a package's mutants that tests must detect."""
 Z: Final = 1.96
@@ -64,9 +65,10 @@ class Score:
         return (middle - width) / (1 + Z * Z / n), (middle + width) / (1 + Z * Z / n)
 
 
-def read_listed(path: Path = LISTED) -> dict[str, str]:
+def read_listed(folder: Path = LISTED) -> dict[str, str]:
     """The listed mutants: text → reason."""
-    groups = tomllib.loads(path.read_text(encoding="utf-8"))["survivors"]
+    files = [tomllib.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.toml"))]
+    groups = [group for file in files for group in file["survivors"]]
     return {mutant: group["reason"] for group in groups for mutant in group["mutants"]}
 
 

@@ -40,7 +40,8 @@ def test_survivors_without_a_reason_and_low_scores_fail() -> None:
 
 
 def test_each_listed_survivor_has_a_reason_and_is_listed_once(tmp_path: Path) -> None:
-    path = tmp_path / "survivors.toml"
-    path.write_text("""[[survivors]]\nreason = "log"\nmutants = ["f: a → b", "g: c → d"]\n""", encoding="utf-8")
-    assert report.read_listed(path) == {"f: a → b": "log", "g: c → d": "log"}
+    for name, mutant in (("actions", "f: a → b"), ("control", "g: c → d")):
+        text = f"""[[survivors]]\nreason = "log"\nmutants = ["{mutant}"]\n"""
+        (tmp_path / f"{name}.toml").write_text(text, encoding="utf-8")
+    assert report.read_listed(tmp_path) == {"f: a → b": "log", "g: c → d": "log"}
     assert all(report.read_listed().values())
