@@ -9,8 +9,10 @@ import pytest
 from device_agent.protocol import Ack, AckStatus, Reason, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from function_app.domain.actions.action import AckReport, Status
+from function_app.domain.devices.devices import Device
 from function_app.ports.monitoring import Counter, Histogram
 from function_app.services.actions.acks import report
+from function_app.services.messaging.delivery import SignedCommand
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person, paired
 from tests.unit.function_app.services.actions.queue_requests import control_rows, pass_time
@@ -114,10 +116,18 @@ def test_the_latency_of_an_ended_action_is_measured_once(
 
 
 def test_the_latency_of_an_action_that_ended_before_its_publication_was_stored_is_measured(
-    anna: Person, robot: Robot, measured: Measured
+    cloud: Cloud, anna: Person, robot: Robot, measured: Measured
 ) -> None:
-    robot.reports = lambda _: (AckStatus.RECEIVED, AckStatus.STARTED, AckStatus.DONE)
-    anna.start(robot.device, wait_ms=10_000, wait_for="done")
+    robot.silent = True
+    send = cloud.functions.delivery.send
+
+    async def answered(device: Device, command: SignedCommand) -> None:
+        await send(device, command)
+        ack = robot.ack(command.command, AckStatus.DONE)
+        await cloud.functions.action_acks.ingest(topics.parse(robot.topic(topics.ACK)), codec.encode(ack))
+
+    with mock.patch.object(cloud.functions.delivery, "send", answered):
+        assert anna.start(robot.device, wait_ms=1_000, wait_for="done").json()["status"] == "done"
     assert measured == [("done", "mqtt")]
 
 
