@@ -84,7 +84,8 @@ class SharedApp:
     def __init__(self, functions: Functions) -> None:
         self._instance = functions
         settings = functions.settings
-        key = (settings.console, settings.trusted_proxies, settings.websocket_url, settings.public_url)
+        servers = (settings.websocket_url, settings.xmpp.websocket_url)
+        key = (settings.console, settings.trusted_proxies, servers, settings.public_url)
         if key not in _apps:
             token = _functions.set(functions)
             _apps[key] = create_app(cast("Functions", _CurrentFunctions()))
