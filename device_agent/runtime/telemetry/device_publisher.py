@@ -237,8 +237,8 @@ class DevicePublisher:
             self._publish_description()
 
     def _publish_description(self) -> None:
-        self._described = own = self._robot_behaviours()
-        self._retain(self._topic(topics.DESC), self._description(own))
+        self._described = self._robot_behaviours()
+        self._retain(self._topic(topics.DESC), self._description())
 
     def publish_state(self, snapshot: StateSnapshot, *, urgent: bool = False) -> None:
         """Publish ``state`` on change, at most once a second unless it is urgent, and every 30 s."""
@@ -294,7 +294,8 @@ class DevicePublisher:
     def _retain(self, topic: str, message: object) -> bool:
         return self._publish(topic, codec.encode(message, limit=codec.MAX_RETAINED_BYTES), qos=1, retain=True)
 
-    def _description(self, own: Sequence[RobotBehaviour]) -> Description:
+    def _description(self) -> Description:
+        own = self._described or ()
         robot_type, room = self._robot_type, self._room_device
         return Description(
             device=self._name,
