@@ -73,7 +73,7 @@ def _credentials(options: argparse.Namespace) -> Credentials | None:
     if not options.host:
         raise ConfigError("name the camera with --host: a password is not sent to every device that responds")
     try:
-        return Credentials(options.user, secret_of(options.password_file))
+        return Credentials(options.user, secret_of(options.password_file.expanduser()))
     except SensorError as error:
         raise ConfigError(str(error)) from error
 
@@ -97,16 +97,19 @@ def _none_found(options: argparse.Namespace) -> str:
 
 def _print_entry(camera: "FoundCamera", credentials: Credentials | None, options: argparse.Namespace) -> None:
     from device_agent.sensors.camera.onvif.client import OnvifClient  # noqa: PLC0415 (as above)
+    from device_agent.sensors.camera.onvif.messages import printable  # noqa: PLC0415 (as above)
 
     try:
-        streams = OnvifClient(camera.service, credentials, ca=options.ca).streams()
+        streams = OnvifClient(
+            camera.service, credentials, ca=str(Path(options.ca).expanduser()) if options.ca else ""
+        ).streams()
     except SensorError as error:
         hint = "" if credentials else "; most cameras need --user and --password-file"
         raise ConfigError(f"{error}{hint}") from error
     chosen = _choose(streams)
     for stream in streams:
         size = f"{stream.profile.width} x {stream.profile.height}" if stream.profile.width else "unknown size"
-        print(f"stream  {stream.profile.name or stream.profile.token}: {size}", file=sys.stderr)
+        print(f"stream  {stream.profile.name or printable(stream.profile.token)}: {size}", file=sys.stderr)
     login = (
         {"user": options.user, "password_file": str(options.password_file.expanduser().resolve())}
         if credentials

@@ -5,6 +5,8 @@ A room device has streams (named values), cameras (frames), captures (raw data f
 ``docs/guides/add-a-sensor.md`` shows an example.
 """
 
+import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -12,6 +14,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from device_agent.ports.clock import wall_ms
 from device_agent.ports.simulation import SimulatedWorld
 
 Floats = npt.NDArray[np.float64]
@@ -76,6 +79,19 @@ class Scan:
     range_m: Floats
     nearest_m: float
     furthest_m: float
+
+    def capture(self) -> Capture:
+        """The scan as a JSON file with the present time; ``null`` for a beam without an echo."""
+        content = {
+            "at_ms": wall_ms(),
+            "position_m": [round(value, 4) for value in self.position_m.tolist()],
+            "rotation": [[round(value, 6) for value in row] for row in self.rotation.tolist()],
+            "angle_rad": [round(value, 6) for value in self.angle_rad.tolist()],
+            "range_m": [round(value, 4) if math.isfinite(value) else None for value in self.range_m.tolist()],
+            "nearest_m": self.nearest_m,
+            "furthest_m": self.furthest_m,
+        }
+        return Capture("application/json", json.dumps(content).encode())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

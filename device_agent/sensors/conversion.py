@@ -47,13 +47,13 @@ class Conversion(Struct, frozen=True, kw_only=True):
             return raw
         if not isinstance(raw, int | float):
             hint = "; map texts with `words`" if isinstance(raw, str) else ""
-            raise ConversionError(f"{_shown(raw)}, which is not a number{hint}")
+            raise ConversionError(f"{shown(raw)}, which is not a number{hint}")
         try:
             value = raw * self.scale + self.offset
         except OverflowError:
             value = math.inf
         if not math.isfinite(value):
-            raise ConversionError(f"{_shown(raw)}, which is not a finite number")
+            raise ConversionError(f"{shown(raw)}, which is not a finite number")
         if (self.lower is not None and value < self.lower) or (self.upper is not None and value > self.upper):
             raise ConversionError(f"{value:g}, outside of its limits {_limit(self.lower)} to {_limit(self.upper)}")
         return value
@@ -63,7 +63,7 @@ class Conversion(Struct, frozen=True, kw_only=True):
         return (value - self.offset) / self.scale
 
 
-def _shown(raw: object) -> str:
+def shown(raw: object) -> str:
     """A raw value for operators: short, and without control characters."""
     text = raw if isinstance(raw, str) else str(raw)
     printable = "".join(letter if letter.isprintable() else "?" for letter in text[:_MAX_TEXT])

@@ -271,7 +271,7 @@ class NaoqiDriver:
         return end
 
     def _wait_for_adoption(self) -> None:
-        """Wait until the agent has received the held position: until the second ``send`` from now has begun."""
+        """Wait until the agent has received the held position: until ``send`` is called for the second time."""
         end_s, sends = time.monotonic() + _ADOPTED_S, self._sends
         while self._sends < sends + 2 and time.monotonic() < end_s:
             time.sleep(_BEHAVIOUR_POLL_S / 4)

@@ -189,6 +189,6 @@ def _digest(challenge: str, address: SplitResult, credentials: Credentials, meth
         passwords.add_password(parameters.get("realm", ""), url, credentials.user, credentials.password)
         request = Request(url, method=method)  # noqa: S310 (never opened; it only carries the address)
         header = AbstractDigestAuthHandler(passwords).get_authorization(request, parameters)
-    except (ValueError, OSError):
+    except (ValueError, LookupError, OSError):
         return None
     return f"Digest {header}" if header else None

@@ -1,5 +1,6 @@
 """Cameras that send JPEGs over HTTP: a multipart stream, or one picture at each request."""
 
+import threading
 import time
 from collections.abc import Iterator
 from http.client import HTTPException, HTTPResponse
@@ -43,10 +44,12 @@ class MjpegSource:
     def __init__(self, options: Options) -> None:
         self._options = options
         self._address = split_address(options.url, ("http", "https"))
+        self._aborted = threading.Event()
         self._client = CameraClient(timeout_s=options.stale_s, tls=lambda: tls_context(options.ca))
 
     def frames(self) -> Iterator[Frame]:
         """See ``FrameSource``."""
+        self._aborted.clear()
         known = credentials(self._options)
         response = self._client.open(self._address, known)
         try:
@@ -66,6 +69,7 @@ class MjpegSource:
 
     def abort(self) -> None:
         """See ``FrameSource``."""
+        self._aborted.set()
         self._client.abort()
 
     def _stream(self, response: HTTPResponse, content_type: str) -> Iterator[Frame]:
@@ -87,7 +91,8 @@ class MjpegSource:
                 )
             self._client.close()
             yield frame_of(content, taken_s, self._address)
-            time.sleep(max(0.0, taken_s + period_s - time.monotonic()))
+            if self._aborted.wait(max(0.0, taken_s + period_s - time.monotonic())):
+                return
             response = self._client.open(self._address, known)
 
 

@@ -77,7 +77,7 @@ def parse(options: Mapping[str, Any], kind: type[Options], *, driver: str, devic
 def with_files(camera: Camera, folder: Path) -> Camera:
     """The options with the paths of their files, which are relative to ``folder``."""
     files = {name: getattr(camera, name) for name in ("password_file", "ca") if getattr(camera, name, "")}
-    return replace(camera, **{name: str(folder / path) for name, path in files.items()})
+    return replace(camera, **{name: str(folder / Path(path).expanduser()) for name, path in files.items()})
 
 
 def split_address(url: str, schemes: tuple[str, ...]) -> SplitResult:
@@ -91,7 +91,7 @@ def split_address(url: str, schemes: tuple[str, ...]) -> SplitResult:
         valid = parts.scheme in schemes and bool(parts.hostname) and parts.port != 0
     except ValueError:
         valid = False
-    if not valid or any(ord(character) <= ord(" ") for character in url):
+    if not valid or " " in url or not url.isprintable():
         examples = " or ".join(f"{scheme}://host/path" for scheme in schemes)
         raise SensorError(f"option 'url' must be an address such as {examples}")
     return parts
@@ -129,7 +129,7 @@ def secret_of(path: Path) -> str:
         SensorError: The file cannot be read, or is empty.
     """
     try:
-        with path.expanduser().open(encoding="utf-8") as file:
+        with path.open(encoding="utf-8") as file:
             secret = file.readline(_MAX_SECRET).rstrip("\r\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
@@ -146,6 +146,6 @@ def tls_context(ca: str) -> ssl.SSLContext:
         SensorError: The file is missing or no certificate.
     """
     try:
-        return ssl.create_default_context(cafile=str(Path(ca).expanduser()) if ca else None)
+        return ssl.create_default_context(cafile=ca or None)
     except OSError as error:
         raise SensorError(f"option 'ca': {ca} cannot be read as a certificate") from error

@@ -31,7 +31,8 @@ def _reasons(where: str) -> Mapping[str, str]:
     return {
         "busy": f"{where} cannot be opened; check that no other program uses the camera",
         "crashed": f"the decoder of {where} has crashed; the agent starts it again. Plug the camera in again",
-        "denied": f"{where}: no permission; add the agent's user to the group video",
+        "denied": f"{where}: no permission; add the agent's user to the group video, and "
+        "allow the service to use cameras as the guide for room cameras describes",
         "library": "driver 'v4l2' needs the package opencv-python-headless; install it with "
         "`pip install telescope-agent[camera]`",
         "missing": f"{where} does not exist; check that the camera is plugged in, and option 'device'",

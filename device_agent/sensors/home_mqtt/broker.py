@@ -194,6 +194,10 @@ class HomeBroker:
         with self._lock:
             if decrypted or any(events & selectors.EVENT_READ for _, events in ready):
                 client.loop_read()
+            if client._in_messages:  # noqa: SLF001 (the library stores them until the broker releases them)
+                raise SensorError(
+                    f"the broker {self._where} sends with QoS 2, which was not requested; check the broker"
+                )
             if client.want_write():
                 client.loop_write()
             client.loop_misc()

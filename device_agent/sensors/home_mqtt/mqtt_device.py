@@ -11,7 +11,7 @@ from device_agent.ports.sensor import SensorError, Values
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors import json_path
 from device_agent.sensors.configured_device import SETTINGS, ConfiguredDevice, SampleInbox
-from device_agent.sensors.conversion import Conversion, ConversionError
+from device_agent.sensors.conversion import Conversion, ConversionError, shown
 from device_agent.sensors.home_mqtt.broker import BrokerOptions, HomeBroker
 
 CONNECT_S = 2.0
@@ -106,14 +106,14 @@ class MqttDevice(ConfiguredDevice, ABC):
                 self._reported.pop(control, None)
             self.send(control, requested)
             with self.changed:
-                confirmed = self.changed.wait_for(
+                self.changed.wait_for(
                     lambda: self._reported.get(control, json_path.MISSING) == requested or bool(self._problem(broker)),
                     self._timeout_s,
                 )
                 reported = self._reported.get(control, json_path.MISSING)
         self._check(broker)
-        if not confirmed:
-            told = "nothing" if reported is json_path.MISSING else f"'{reported}'"
+        if reported != requested:
+            told = "nothing" if reported is json_path.MISSING else shown(reported)
             raise SensorError(
                 f"'{self.device.name}' has not confirmed '{control}' within {self._timeout_s:g} s: "
                 f"'{requested}' was requested, and it reports {told}"
@@ -218,6 +218,12 @@ class MqttDevice(ConfiguredDevice, ABC):
             if any(self.kind_of(source) == kind for source in sources.values()):
                 self.inbox.fail(stream, f"stream '{stream}' of '{self.device.name}': {problem}", kind)
 
+    def forget_values(self) -> None:
+        """Forget all values: the device is not available. Called with the lock of ``changed``."""
+        self._reported.clear()
+        self._present.clear()
+        self.inbox.clear()
+
     def kind_of(self, source: JsonSource) -> str:  # noqa: ARG002 (subclasses with several kinds use it)
         """Kind of the messages that contain a source."""
         return ""
@@ -252,9 +258,7 @@ class MqttDevice(ConfiguredDevice, ABC):
 
     def _forget(self) -> None:
         self.on_disconnected()
-        self._reported.clear()
-        self._present.clear()
-        self.inbox.clear()
+        self.forget_values()
 
     def _on_broker_change(self) -> None:
         broker = self._broker
@@ -273,6 +277,12 @@ class MqttDevice(ConfiguredDevice, ABC):
         with self.changed:
             self.on_message(topic, payload, retained=retained)
             self.changed.notify_all()
+
+
+def stepped(raw: float, step: float) -> int | float:
+    """The nearest multiple of ``step``, as devices report it: without a fraction if it is a whole number."""
+    rounded = round(raw / step) * step
+    return int(rounded) if rounded == int(rounded) else round(rounded, 6)
 
 
 def _values(document: Any, sources: Mapping[str, JsonSource], kind: str) -> dict[str, float | bool]:

@@ -3,6 +3,7 @@
 Topics and messages: https://tasmota.github.io/docs/MQTT/ and https://tasmota.github.io/docs/Commands/
 """
 
+import contextlib
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from device_agent.sensors import json_path
 from device_agent.sensors.configured_device import parse_options
 from device_agent.sensors.conversion import Conversion
 from device_agent.sensors.home_mqtt.broker import BrokerOptions
-from device_agent.sensors.home_mqtt.mqtt_device import JsonSource, MqttDevice
+from device_agent.sensors.home_mqtt.mqtt_device import JsonSource, MqttDevice, stepped
 
 _POWER = re.compile(r"POWER(\d*)", re.IGNORECASE)
 _SHUTTER = re.compile(r"ShutterPosition(\d*)", re.IGNORECASE)
@@ -178,9 +179,13 @@ class TasmotaDevice(MqttDevice):
     def on_message(self, topic: str, payload: bytes, *, retained: bool) -> None:
         """See ``MqttDevice``."""
         if topic == self._last_will:
+            returned = self._available is False
             self._available = payload == b"Online"
             if not self._available:
-                self.inbox.clear()
+                self.forget_values()
+            elif returned:
+                with contextlib.suppress(SensorError):  # lost again: the next connection repeats it
+                    self.on_connected()
             return
         if retained:
             return  # of unknown age
@@ -204,13 +209,15 @@ class TasmotaDevice(MqttDevice):
     def requested(self, control: str, raw: float) -> object:
         """See ``MqttDevice``."""
         step = self._options.controls[control].step
-        rounded = round(raw / step) * step
+        value = stepped(raw, step)
         if self._commands[control].on_off:
-            return ON if rounded > 0 else OFF
-        return int(rounded) if rounded == int(rounded) else round(rounded, 6)
+            return ON if value > 0 else OFF
+        return value
 
     def send(self, control: str, requested: object) -> None:
         """See ``MqttDevice``."""
+        with self.changed:
+            self._directions.pop(control, None)  # a motion may begin, so only a new report shows rest
         self.publish(self._topic("cmnd", self._options.controls[control].command), str(requested))
 
     def raw_setting(self, control: str, reported: object) -> object:

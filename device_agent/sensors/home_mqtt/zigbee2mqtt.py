@@ -22,7 +22,7 @@ from device_agent.sensors import json_path
 from device_agent.sensors.configured_device import parse_options
 from device_agent.sensors.conversion import Conversion
 from device_agent.sensors.home_mqtt.broker import BrokerOptions
-from device_agent.sensors.home_mqtt.mqtt_device import JsonSource, MqttDevice
+from device_agent.sensors.home_mqtt.mqtt_device import JsonSource, MqttDevice, stepped
 
 _SET, _GET = 2, 4
 """Bits of ``access``: the property can be set; its value can be requested."""
@@ -105,7 +105,7 @@ class Zigbee2MqttDevice(MqttDevice):
         self._bridge_online: bool | None = None
         self._available: bool | None = None
         self._exposed: dict[str, _Expose] | None = None
-        self._cover = False
+        self._cover = False  # as described last, so that a lost cover is stopped when it is back
         self._mismatch = ""
         self._answered = False
 
@@ -135,7 +135,7 @@ class Zigbee2MqttDevice(MqttDevice):
     def on_disconnected(self) -> None:
         """See ``MqttDevice``."""
         self._bridge_online = self._available = self._exposed = None
-        self._cover, self._mismatch = False, ""
+        self._mismatch = ""
 
     def problem(self) -> str:
         """See ``MqttDevice``."""
@@ -160,11 +160,11 @@ class Zigbee2MqttDevice(MqttDevice):
         elif topic == self._bridge_state:
             self._bridge_online = _online(payload)
             if not self._bridge_online:
-                self.inbox.clear()
+                self.forget_values()
         elif topic != self._topic:
             self._available = _online(payload)
             if not self._available:
-                self.inbox.clear()
+                self.forget_values()
         elif not retained:  # a retained one is of unknown age
             self._on_state(payload)
 
@@ -173,9 +173,7 @@ class Zigbee2MqttDevice(MqttDevice):
         exposed = self._property(control)
         if exposed.type == "binary":
             return exposed.value_on if raw >= 0.5 else exposed.value_off  # noqa: PLR2004 (the nearer value)
-        step = exposed.value_step or 1.0
-        rounded = round(raw / step) * step
-        return int(rounded) if rounded == int(rounded) else round(rounded, 6)
+        return stepped(raw, exposed.value_step or 1.0)
 
     def send(self, control: str, requested: object) -> None:
         """See ``MqttDevice``."""
@@ -202,7 +200,7 @@ class Zigbee2MqttDevice(MqttDevice):
 
     def _describe(self, payload: bytes) -> None:
         """Check the options against the description of the device."""
-        self._exposed, self._cover, self._mismatch = None, False, ""
+        self._exposed, self._mismatch = None, ""
         try:
             described = _DEVICES.decode(payload)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -259,12 +257,13 @@ class Zigbee2MqttDevice(MqttDevice):
         if not isinstance(document, dict):
             self.fail("a message was rejected: it is not a JSON object")
             return
+        if _age_s(document.get("last_seen")) > self._options.max_age_s:
+            return  # Zigbee2MQTT repeats stored values when it starts
         self._answered = True
         for name, control in self._options.controls.items():
             if (value := document.get(control.property)) is not None:
                 self.report(name, value, value)
-        if _age_s(document.get("last_seen")) <= self._options.max_age_s:
-            self.sample(document)
+        self.sample(document)
 
 
 def _properties(exposes: Collection[_Expose], depth: int) -> Iterator[_Expose]:
@@ -286,14 +285,13 @@ def _online(payload: bytes) -> bool:
 
 def _age_s(last_seen: object) -> float:
     """Age of a message by its ``last_seen`` [s]; 0 if the settings of Zigbee2MQTT leave it out."""
-    now_s = time.time()
-    if isinstance(last_seen, int | float):
-        return now_s - last_seen / 1000
-    if isinstance(last_seen, str):
-        try:
-            return now_s - datetime.fromisoformat(last_seen).timestamp()
-        except (ValueError, OverflowError, OSError):
-            return 0.0
+    try:
+        if isinstance(last_seen, int | float):
+            return time.time() - last_seen / 1000
+        if isinstance(last_seen, str):
+            return time.time() - datetime.fromisoformat(last_seen).timestamp()
+    except (ValueError, OverflowError, OSError):
+        return 0.0
     return 0.0
 
 

@@ -1,6 +1,5 @@
 """A single-plane lidar."""
 
-import json
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -8,7 +7,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from device_agent.ports.clock import wall_ms
 from device_agent.ports.sensor import Capture, Floats, Scan, Values
 from device_agent.ports.simulation import SimulatedWorld
 from device_agent.protocol.manifests.room import RoomDeviceManifest
@@ -95,14 +93,4 @@ class Lidar(SimulatedSensor):
         """See ``RoomDriver``."""
         if name not in self._device.captures:
             return super().capture(name)
-        scan = self.raw()
-        content = {
-            "at_ms": wall_ms(),
-            "position_m": [round(value, 4) for value in scan.position_m.tolist()],
-            "rotation": [[round(value, 6) for value in row] for row in scan.rotation.tolist()],
-            "angle_rad": [round(value, 6) for value in scan.angle_rad.tolist()],
-            "range_m": [round(value, 4) if math.isfinite(value) else None for value in scan.range_m.tolist()],
-            "nearest_m": scan.nearest_m,
-            "furthest_m": scan.furthest_m,
-        }
-        return Capture("application/json", json.dumps(content).encode())
+        return self.raw().capture()

@@ -1,7 +1,6 @@
 """Lidars and point clouds over ROS."""
 
 import json
-import math
 
 import numpy as np
 
@@ -32,17 +31,7 @@ class Lidar(RosSensor):
         """See ``RoomDriver``."""
         if name not in self.CAPTURES:
             return super().capture(name)
-        scan = self.raw()
-        content = {
-            "at_ms": wall_ms(),
-            "position_m": [round(value, 4) for value in scan.position_m.tolist()],
-            "rotation": [[round(value, 6) for value in row] for row in scan.rotation.tolist()],
-            "angle_rad": [round(value, 6) for value in scan.angle_rad.tolist()],
-            "range_m": [round(value, 4) if math.isfinite(value) else None for value in scan.range_m.tolist()],
-            "nearest_m": scan.nearest_m,
-            "furthest_m": scan.furthest_m,
-        }
-        return Capture("application/json", json.dumps(content).encode())
+        return self.raw().capture()
 
     def raw(self) -> Scan:
         """See ``RoomDriver``."""

@@ -2,7 +2,9 @@
 
 import json
 import re
+import socket
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -11,7 +13,7 @@ from device_agent.ports.sensor import RoomDriver, SensorError
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from tests.contract.sensors.conftest import MakeDriver, connects, described, error_of, sample
 from tests.contract.sensors.suite import RoomDriverContract
-from tests.harness.network.brokers import wait_until
+from tests.harness.network.brokers import HOST, wait_until
 from tests.harness.robots.room_devices.house_broker import PASSWORD, HouseBroker
 from tests.harness.robots.room_devices.tasmota import Tasmota
 
@@ -134,6 +136,64 @@ def test_a_shutter_that_does_not_confirm_its_stop_is_an_error(connected: RoomDri
     tasmota.deaf = True
     with pytest.raises(SensorError, match="has not confirmed within 1 s that it has stopped"):
         connected.hold()  # type: ignore[attr-defined]
+
+
+def test_a_shutter_that_has_not_reported_since_its_command_may_move(connected: RoomDriver, tasmota: Tasmota) -> None:
+    connected.set("opening", 0.5)
+    wait_until(lambda: connected._directions == {"opening": 0}, "its rest")  # type: ignore[attr-defined]
+    tasmota.deaf = True
+    connected.send("opening", 90)  # type: ignore[attr-defined]
+    with pytest.raises(SensorError, match="has not confirmed within 1 s that it has stopped"):
+        connected.hold()  # type: ignore[attr-defined]
+
+
+def test_a_loss_that_has_ended_confirms_no_value(
+    connected: RoomDriver, tasmota: Tasmota, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tasmota.deaf = True
+    problems = iter(["", "off line", ""])
+    monkeypatch.setattr(connected, "_problem", lambda _broker: next(problems))
+    with pytest.raises(SensorError, match="has not confirmed 'relay'"):
+        connected.set("relay", 1.0)
+
+
+def test_values_before_an_absence_are_forgotten_and_requested_again(connected: RoomDriver, tasmota: Tasmota) -> None:
+    connected.set("relay", 1.0)
+    tasmota.publish("tele", "LWT", "Offline", retain=True)
+    wait_until(lambda: not connects(connected), "the loss")
+    tasmota.state["POWER"] = "OFF"  # a power cycle
+    before = len(tasmota.commands)
+    tasmota.deaf = True
+    tasmota.publish("tele", "LWT", "Online", retain=True)
+    wait_until(lambda: tasmota.commands[before:] == [("STATUS", "10"), ("STATUS", "11")], "the request")
+    assert connected.read("settings") == {}
+    tasmota.deaf = False
+    tasmota.send_state()
+    wait_until(lambda: connected.read("settings").get("relay") == 0.0, "the present value")
+
+
+def test_a_broker_that_sends_with_qos_2_is_left(house: HouseBroker, make_driver: MakeDriver) -> None:
+    """The library stores such messages until the broker releases them."""
+    with socket.create_server((HOST, 0)) as server:
+        port = server.getsockname()[1]
+        driver = make_driver(entry_of(house, broker=house.options(port=port)))
+        filters = len(driver.filters())  # type: ignore[attr-defined]
+
+        def serve() -> None:
+            client, _ = server.accept()
+            with client:
+                client.recv(4096)
+                client.sendall(b"\x20\x02\x00\x00")
+                packet_id = client.recv(4096)[2:4]
+                client.sendall(bytes([0x90, 2 + filters, *packet_id]) + b"\x01" * filters)
+                client.sendall(b"\x34\x06\x00\x01a\x00\x01x")
+                while client.recv(4096):
+                    pass
+
+        with ThreadPoolExecutor() as pool:
+            served = pool.submit(serve)
+            wait_until(lambda: "sends with QoS 2" in error_of(driver.connect), "the end of the connection")
+            served.result(20)
 
 
 def test_the_last_will_is_a_fault_until_the_device_returns(connected: RoomDriver, tasmota: Tasmota) -> None:

@@ -104,6 +104,11 @@ def test_a_message_with_an_old_last_seen_is_no_sample(connected: RoomDriver, bri
     assert sample(connected, "air")["temperature_c"] == 21.0
 
 
+def test_a_last_seen_that_is_no_time_is_ignored(connected: RoomDriver, bridge: Zigbee2Mqtt) -> None:
+    bridge.publish("thermometer", f'{{"temperature": 22.0, "humidity": 40, "last_seen": {"1" * 400}}}')
+    assert sample(connected, "air")["temperature_c"] == 22.0
+
+
 def test_plug_bulb_and_blind_confirm_the_applied_value(
     house: HouseBroker, bridge: Zigbee2Mqtt, make_driver: MakeDriver
 ) -> None:
@@ -118,6 +123,41 @@ def test_plug_bulb_and_blind_confirm_the_applied_value(
     assert bridge.states["blind"]["position"] == 30
     blind.hold()  # type: ignore[attr-defined]
     assert ("blind/set", {"state": "STOP"}) in bridge.commands
+
+
+def test_a_lost_cover_cannot_be_held_and_is_stopped_when_it_is_back(
+    house: HouseBroker, bridge: Zigbee2Mqtt, make_driver: MakeDriver
+) -> None:
+    blind = make_driver(settable(house, "blind", opening={"property": "position", "scale": 0.01}))
+    blind.connect()
+    bridge.vanish()
+    house.stop()
+    wait_until(lambda: not connects(blind), "the loss")
+    with pytest.raises(SensorError, match="broker"):
+        blind.hold()  # type: ignore[attr-defined]
+    house.start()
+    bridge.connect()
+    wait_until(lambda: connects(blind), "the return")
+    blind.hold()  # type: ignore[attr-defined]
+    wait_until(lambda: ("blind/set", {"state": "STOP"}) in bridge.commands, "the stop")
+
+
+def test_stored_values_and_those_before_an_absence_are_no_settings(
+    house: HouseBroker, bridge: Zigbee2Mqtt, make_driver: MakeDriver
+) -> None:
+    plug = make_driver(settable(house, "plug", on={"property": "state"}))
+    plug.connect()
+    wait_until(lambda: plug.read("settings") == {"on": 0.0}, "the present value")
+    bridge.publish("plug/availability", {"state": "offline"})
+    wait_until(lambda: not connects(plug), "the absence")
+    bridge.publish("plug/availability", {"state": "online"})
+    wait_until(lambda: connects(plug), "the return")
+    assert plug.read("settings") == {}
+    plug._answered = False  # type: ignore[attr-defined]
+    bridge.publish("plug", {"state": "ON", "last_seen": "2020-01-01T00:00:00Z"})
+    bridge.publish("plug", {"power": 4.0})
+    wait_until(lambda: plug._answered, "a message that follows the stored one")  # type: ignore[attr-defined]
+    assert plug.read("settings") == {}
 
 
 def test_a_device_that_does_not_respond_is_an_error(

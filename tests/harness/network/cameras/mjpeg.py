@@ -24,7 +24,7 @@ class MjpegCamera(ThreadingHTTPServer):
     """Serves in a thread until ``close``.
 
     Attributes:
-        authentication: Required authentication: ``basic``, ``digest``, or empty for none.
+        authentication: Required authentication: ``basic``, ``digest``, ``malformed``, or empty for none.
         requests: Path and ``Authorization`` header of each request.
         frozen: Whether the stream sends no further pictures; the connection stays open.
         sent_bytes: Number of bytes of giant responses that the client has accepted.
@@ -215,6 +215,7 @@ class _Handler(BaseHTTPRequestHandler):
         challenges = {
             "basic": f'Basic realm="{REALM}"',
             "digest": f'Digest realm="{REALM}", nonce="{NONCE}", qop="auth"',
+            "malformed": f'Digest realm=, nonce="{NONCE}"',
         }
         self.send_header("WWW-Authenticate", challenges[self.server.authentication])
         self.end_headers()
@@ -227,6 +228,8 @@ class _Handler(BaseHTTPRequestHandler):
                 return authorization == "Basic dmlld2VyOnNlL2NyZXRAMQ=="  # pragma: allowlist secret
             case "digest":
                 return _digest_is_valid(authorization, self.command)
+            case "malformed":
+                return False
         return True
 
 
