@@ -43,18 +43,24 @@ class BrokerLink:
     def renew(self) -> None:
         """Connect with new credentials. Exits with a text if they are rejected."""
         client, credentials = create_client(self._request)
-        self.renew_s = time.monotonic() + min(self._longest_s, RENEW_AFTER * credentials["lifetime_s"])
-        if not self._subscriptions:
-            self.close()  # the broker allows one connection for each lease
-            self._client = client
         client.on_connect = lambda *_: self._subscriptions and client.subscribe(self._subscriptions)
         client.on_message = lambda _client, _data, message: self._receive(client, message)
+        previous = None if self._subscriptions else self._client
+        if previous is not None:
+            previous.on_disconnect = None  # the broker allows one connection for each lease, so it may end this one
         try:
             client.connect(credentials["tcp"]["host"], credentials["tcp"]["port"])
         except OSError as error:
+            if previous is not None:
+                previous.on_disconnect = lambda *_: self._on_lost()
             sys.exit(f"the broker does not respond: {error}")
+        self.renew_s = time.monotonic() + min(self._longest_s, RENEW_AFTER * credentials["lifetime_s"])
         client.on_disconnect = lambda *_: self._on_lost()
         client.loop_start()
+        if not self._subscriptions:
+            with self._lock:
+                self._client = client
+            _end(previous)
 
     def publish(self, name: str, payload: bytes) -> None:
         """Publish a setpoint."""

@@ -15,11 +15,14 @@ URL = os.environ.get("TELESCOPE_URL", "http://127.0.0.1:8080") + "/api/v1"
 
 
 def call(method: str, path: str, body: dict[str, Any] | None = None) -> Any:
-    """Call the API and return the parsed response. Exits with the problem's text if the call is rejected."""
+    """Call the API and return the parsed response. Exits with a text if it is rejected or not answered."""
     headers = {"Authorization": f"Bearer {os.environ['TELESCOPE_TOKEN']}"}
     if method == "POST":
         headers["Idempotency-Key"] = str(uuid.uuid4())
-    response = requests.request(method, URL + path, json=body, headers=headers, timeout=60)
+    try:
+        response = requests.request(method, URL + path, json=body, headers=headers, timeout=60)
+    except requests.RequestException:
+        sys.exit(f"{method} {path}: no response from {URL}; check TELESCOPE_URL and the network")
     if not response.ok:
         sys.exit(f"{method} {path}: {response.status_code} {response.text}")
     return response.json() if response.content else None

@@ -15,8 +15,8 @@ from function_app.ports.xmpp_connection import XmppConnection
 
 MAX_SESSIONS = 200
 """Operators at one gateway; each needs one broker connection, and one for each device under control."""
-MAX_OF_ACCOUNT = 8
-"""Sessions of one account at one gateway; a further sign-in ends the oldest."""
+MAX_OF_ACCOUNT = 32
+"""Sessions of one account at one gateway; a further sign-in ends the oldest. A page has one for each lease."""
 _log = logging.getLogger(__name__)
 
 
@@ -58,6 +58,8 @@ class Operators:
                     self._connection.send(operator_stanzas.problem(jid, request.id, status, detail))
             elif delivery is not None and session is not None:
                 session.receive_setpoint(delivery)
+            elif delivery is not None:  # its session was ended for a newer one
+                self._connection.send(stanzas.rejection(jid, stanza.get("id", ""), "Sign in first."))
         except ProtocolError as error:
             _log.warning("rejected a message of %s: %s", account, error)
             if stanza.get("id") and stanza.get("type") != "error":

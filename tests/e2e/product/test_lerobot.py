@@ -74,11 +74,14 @@ def key(machine: Machine) -> str:
 
 
 @contextlib.contextmanager
-def plugin(machine: Machine, packages: Path, kind: str, key: str, device: str = "ur5") -> Iterator[Plugin]:
+def plugin(
+    machine: Machine, packages: Path, kind: str, key: str, device: str = "ur5", **environment: str
+) -> Iterator[Plugin]:
     process = subprocess.Popen(
         [LEROBOT_PYTHON, "-P", PROGRAM, BRIDGE, kind, machine.url, device],
         env={
             **os.environ,
+            **environment,
             "PYTHONPATH": str(packages),
             "TELESCOPE_TOKEN": key,
             "HF_LEROBOT_HOME": str(packages / "hf"),
@@ -141,6 +144,18 @@ def test_limits_change_the_applied_action(machine: Machine, packages: Path, key:
         wait_until(
             lambda: robot.send_action({"elbow.pos": elbow})["elbow.pos"] == pytest.approx(elbow, abs=0.5),
             "the way back",
+        )
+
+
+def test_control_outlasts_the_credentials_of_the_broker(machine: Machine, packages: Path, key: str) -> None:
+    with machine.api() as api, plugin(machine, packages, "robot", key, RENEW_PERIOD_S="0.3") as robot:
+        api.free_device()
+        robot.call("connect")
+        start = wrist(machine)
+        wait_until(lambda: robot.send_action({"wrist_3.pos": start + 5}) and robot.call("opened") > 4, "renewals")
+        wait_until(
+            lambda: robot.send_action({"wrist_3.pos": start + 10})["wrist_3.pos"] == pytest.approx(start + 10),
+            "the action",
         )
 
 

@@ -164,6 +164,9 @@ def test_the_number_of_sessions_is_limited_for_an_account_and_in_total(
         assert first.sign_in().status == 204
         assert second.sign_in().status == 204
         assert first.call("GET", "/devices")[0] == 401
+        topic = "ts/v1/space/agent/device/ctl/1"
+        first.publish(topic, sealed({"epoch": 1, "setpoint_key": "00" * 32}, topic))
+        wait_until(first.rejections, "a rejection of the ended session's setpoint")
         with XmppOperator(site.prosody.port, site.cloud.sign_in("bert")) as other:
             assert other.sign_in().status == 503
         assert second.call("GET", "/devices")[0] == 200

@@ -3,6 +3,7 @@
 import contextlib
 import hmac
 import json
+import math
 import os
 import threading
 import time
@@ -14,7 +15,11 @@ import paho.mqtt.client as mqtt
 import requests
 
 RENEW_S = 10.0
-"""Period in which the lease is renewed [s]; it lasts 30 s."""
+"""Period in which the lease is renewed [s]."""
+LEASE_S = 30.0
+"""Duration of the lease [s]."""
+RENEW_AFTER = 0.5
+"""Credentials of the broker are replaced after this share of their lifetime."""
 START_S = 10.0
 """Time for the first telemetry, and for the device's confirmation of the lease [s]."""
 OLD_S = 1.0
@@ -28,6 +33,10 @@ INPUT = 1
 
 class TelescopeError(ConnectionError):
     """The device cannot be observed or moved. The message says what to do."""
+
+
+class UnreachableError(TelescopeError):
+    """Telescope does not respond."""
 
 
 class Device:
@@ -46,9 +55,13 @@ class Device:
         self._telemetry: dict[str, Any] | None = None
         self._received_s = 0.0
         self._watcher: mqtt.Client | None = None
+        self._watcher_due_s = math.inf
         self._lease: dict[str, Any] | None = None
+        self._lease_ends_s = 0.0
         self._control: mqtt.Client | None = None
-        self._ending = threading.Event()
+        self._control_due_s = math.inf
+        self._closing = threading.Event()
+        self._renewing = threading.Lock()
         self._sequence = 0
         self._lost = ""
 
@@ -64,11 +77,9 @@ class Device:
 
     def watch(self) -> None:
         """Receive telemetry. Raises ``TelescopeError`` if there is none."""
-        name = self._topic("tele/joints")
-        self._watcher = self._connect_to_broker({"purpose": "view"})
-        self._watcher.on_message = lambda _client, _data, message: self._receive(message.payload)
-        self._watcher.on_connect = lambda client, *_: client.subscribe([(name, 0)])
-        self._watcher.loop_start()
+        self._closing = threading.Event()
+        self._open_watcher()
+        threading.Thread(target=self._renew, args=(self._closing,), daemon=True).start()
         try:
             self._wait(bool, START_S, f"'{self.name}' sends no telemetry; check that it is online")
         except TelescopeError:
@@ -78,18 +89,16 @@ class Device:
     def take_control(self) -> None:
         """Take the lease. Raises ``TelescopeError`` if another operator has it, or the device does not confirm it."""
         lease = self._call("POST", f"/devices/{self._device()['id']}/lease", {})
-        self._lease, self._sequence, self._lost = lease, 0, ""
-        self._ending = threading.Event()
+        self._sequence, self._lost, self._lease_ends_s = 0, "", time.monotonic() + LEASE_S
+        self._lease = lease
         try:
-            request = {"purpose": "control", "device": self._device()["id"], "epoch": lease["epoch"]}
-            self._control = self._connect_to_broker(request)
-            self._control.loop_start()
+            with self._renewing:
+                self._open_control(lease)
             message = f"'{self.name}' does not confirm the lease; check that it is online"
             self._wait(lambda telemetry: telemetry.get("epoch", 0) == lease["epoch"], START_S, message)
         except TelescopeError:
             self.release()
             raise
-        threading.Thread(target=self._renew, args=(self._ending,), daemon=True).start()
 
     def position_rad(self) -> list[float]:
         """Measured positions of all joints [rad]. Raises ``TelescopeError``."""
@@ -113,24 +122,22 @@ class Device:
 
     def release(self) -> None:
         """Release the lease. May be called repeatedly."""
-        self._ending.set()
-        lease, self._lease = self._lease, None
-        control, self._control = self._control, None
+        with self._renewing:
+            lease, self._lease = self._lease, None
+            control, self._control = self._control, None
         if lease is not None:
             with contextlib.suppress(TelescopeError):  # it expires by itself
                 self._call("DELETE", f"/devices/{self._device()['id']}/lease?epoch={lease['epoch']}")
-        if control is not None:
-            control.disconnect()
-            control.loop_stop()
+        _end(control)
 
     def close(self) -> None:
         """Release the lease and end the connections. May be called repeatedly."""
+        self._closing.set()
         self.release()
-        watcher, self._watcher = self._watcher, None
+        with self._renewing:
+            watcher, self._watcher = self._watcher, None
         self._telemetry = None
-        if watcher is not None:
-            watcher.disconnect()
-            watcher.loop_stop()
+        _end(watcher)
 
     # ------------------------------------------------------------ telemetry and setpoints
 
@@ -187,15 +194,52 @@ class Device:
         tag = hmac.new(bytes.fromhex(lease["setpoint_key"]), text.encode(), "sha256").hexdigest()[:32]
         control.publish(name, f'{{"tag":"{tag}","body":{body}}}', qos=0)
 
-    def _renew(self, ending: threading.Event) -> None:
-        while not ending.wait(RENEW_S):
-            lease = self._lease
-            try:
-                if lease is not None:
-                    self._call("POST", f"/devices/{self._device()['id']}/lease", {"epoch": lease["epoch"]})
-            except TelescopeError as error:
+    # ------------------------------------------------------------ renewal
+
+    def _renew(self, closing: threading.Event) -> None:
+        """Renew the lease, and the connections to the broker before their credentials expire."""
+        while not closing.wait(RENEW_S):
+            with self._renewing:
+                if closing.is_set():
+                    return
+                self._renew_lease()
+                with contextlib.suppress(TelescopeError):  # the present credentials are still valid
+                    if self._lease is not None and time.monotonic() >= self._control_due_s:
+                        self._open_control(self._lease)
+                    if time.monotonic() >= self._watcher_due_s:
+                        self._open_watcher()
+
+    def _renew_lease(self) -> None:
+        if self._lease is None or self._lost:
+            return
+        try:
+            self._call("POST", f"/devices/{self._device()['id']}/lease", {"epoch": self._lease["epoch"]})
+            self._lease_ends_s = time.monotonic() + LEASE_S
+        except UnreachableError as error:
+            if time.monotonic() >= self._lease_ends_s:
                 self._lost = str(error)
-                return
+        except TelescopeError as error:
+            self._lost = str(error)
+
+    def _open_control(self, lease: dict[str, Any]) -> None:
+        """Replace the connection for setpoints."""
+        request = {"purpose": "control", "device": self._device()["id"], "epoch": lease["epoch"]}
+        client, lifetime_s = self._connect_to_broker(request)
+        client.loop_start()
+        previous, self._control = self._control, client
+        self._control_due_s = time.monotonic() + RENEW_AFTER * lifetime_s
+        _end(previous)
+
+    def _open_watcher(self) -> None:
+        """Replace the connection for telemetry."""
+        name = self._topic("tele/joints")
+        client, lifetime_s = self._connect_to_broker({"purpose": "view"})
+        client.on_message = lambda _client, _data, message: self._receive(message.payload)
+        client.on_connect = lambda client, *_: client.subscribe([(name, 0)])
+        client.loop_start()
+        previous, self._watcher = self._watcher, client
+        self._watcher_due_s = time.monotonic() + RENEW_AFTER * lifetime_s
+        _end(previous)
 
     # ------------------------------------------------------------ requests
 
@@ -221,12 +265,13 @@ class Device:
         try:
             response = requests.request(method, f"{self._url}/api/v1{path}", json=body, headers=headers, timeout=30)
         except requests.RequestException as error:
-            raise TelescopeError(f"Telescope at {self._url} cannot be reached; check the address") from error
+            raise UnreachableError(f"Telescope at {self._url} cannot be reached; check the address") from error
         if not response.ok:
             raise TelescopeError(f"Telescope has rejected the request: {_detail(response)}")
         return response.json() if response.content else None
 
-    def _connect_to_broker(self, request: dict[str, Any]) -> mqtt.Client:
+    def _connect_to_broker(self, request: dict[str, Any]) -> tuple[mqtt.Client, float]:
+        """A connection whose loop does not run yet, and the lifetime of its credentials [s]."""
         credentials = self._call("POST", "/mqtt/credentials", request)
         client = mqtt.Client(
             mqtt.CallbackAPIVersion.VERSION2, client_id=credentials["client_id"], protocol=mqtt.MQTTv311
@@ -237,8 +282,14 @@ class Device:
         try:
             client.connect(credentials["tcp"]["host"], credentials["tcp"]["port"])
         except OSError as error:
-            raise TelescopeError("the broker of Telescope cannot be reached; check the network") from error
-        return client
+            raise UnreachableError("the broker of Telescope cannot be reached; check the network") from error
+        return client, float(credentials["lifetime_s"])
+
+
+def _end(client: mqtt.Client | None) -> None:
+    if client is not None:
+        client.disconnect()
+        client.loop_stop()
 
 
 def _detail(response: requests.Response) -> str:

@@ -7,9 +7,10 @@ from fastapi import Request, Response
 
 from device_agent.protocol.xmpp import jids
 from function_app.bootstrap import Functions
+from function_app.domain.common.problems import forbidden
 from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.control.schemas import AgentCredentialsRequest, ControlCredentialsRequest
-from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
+from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, bearer
 from function_app.entrypoints.http.framework.responses import json_response, read
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.messaging import schemas
@@ -25,7 +26,7 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         "POST /xmpp/credentials",
         "Get XMPP credentials",
         schemas.XmppCredentialsOut,
-        (404, 409),
+        (403, 404, 409),
         body=schemas.XmppCredentialsRequest,
         caller="account or agent",
     )
@@ -40,6 +41,8 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             space = agent.space
         elif isinstance(payload, ControlCredentialsRequest):
             caller = await auth.account(request)
+            if bearer(request):
+                raise forbidden("Only a signed-in page gets these credentials: an access token cannot renew itself.")
             await functions.mqtt_credentials.require_control(caller, payload.device, payload.epoch)
             issued, token = await functions.xmpp_credentials.browser(caller)
             websocket_url = functions.settings.xmpp.websocket_url

@@ -5,6 +5,7 @@ is a call with its arguments; each answer is the result, or the kind and text of
 """
 
 import json
+import os
 import sys
 from typing import Any
 
@@ -35,10 +36,18 @@ config_class, make = {
     "teleoperator": (TeleoperatorConfig, make_teleoperator_from_config),
 }[kind]
 robot = make(config_class.get_choice_class("telescope")(id="test", device=device, url=url))
+opened: list[dict[str, Any]] = []
+if period_s := os.environ.get("RENEW_PERIOD_S"):
+    # Renews all credentials in each period, and counts those for setpoints as ``opened``.
+    from lerobot_robot_telescope import client
+
+    client.RENEW_S, client.RENEW_AFTER = float(period_s), 0.0
+    open_control = client.Device._open_control
+    client.Device._open_control = lambda used, lease: (open_control(used, lease), opened.append(lease))
 for line in sys.stdin:
     method, *given = json.loads(line)
     try:
-        answer = {"result": call(robot, method, given)}
+        answer = {"result": len(opened) if method == "opened" else call(robot, method, given)}
     except Exception as error:  # noqa: BLE001 (the test judges it)
         answer = {"kind": type(error).__name__, "error": str(error)}
     sys.stdout.write(json.dumps(answer) + "\n")

@@ -65,6 +65,17 @@ describe("stop", () => {
     expect(stop.state.value.kind).toBe("clear");
   });
 
+  it("keeps the error of its reset while the page does not know the robot's state", async () => {
+    link.set("down");
+    server.on(`POST ${STOP}`, ok({ outcome: "confirmed" }));
+    server.on(`POST ${STOP}/reset`, ok({ confirmed: false, reason: null }));
+    stop.press();
+    await pass(100);
+    await stop.reset();
+    await pass(100);
+    expect(stop.error.value).toBe("The robot has not confirmed the reset yet.");
+  });
+
   it.each([
     [ok({ outcome: "unreachable" }), "unreachable"],
     [problem(503, "broker-unavailable", "No broker."), "unreachable"],

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import httpx
 import jwt
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -17,7 +18,8 @@ from function_app.services.storage import records
 from function_app.settings.broker import Xmpp
 from tests.fakes.agent import Robot
 from tests.fixtures.cloud import OpenCloud
-from tests.harness.cloud.cloud import Cloud, Person, paired
+from tests.harness.cloud.cloud import API as API_PATH
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
 
 CLOUD_CONTACT = Contact("cloud", "Telescope")
 
@@ -49,6 +51,14 @@ def store(cloud: Cloud, agent: Agent) -> None:
 
 def identity(person: Person) -> Identity:
     return Identity(person.account, person.name, person.session)
+
+
+def signed_in_page(cloud: Cloud, account: str) -> Callable[[str, object], httpx.Response]:
+    """Sends changing requests of a page with the cookie of its session."""
+    client = cloud.client()
+    answer = cloud.run(client.post(f"{API_PATH}/auth/sign-in", json={"link": cloud.link(account)}))
+    headers = {"X-CSRF-Token": answer.json()["csrf_token"]}
+    return lambda path, body: cloud.run(client.post(API_PATH + path, json=body, headers=headers))
 
 
 def passwords(cloud: Cloud, anna: Person, robot: Robot) -> dict[str, Password]:
@@ -115,12 +125,12 @@ def test_a_server_without_browsers_issues_no_token(open_cloud: OpenCloud) -> Non
 
 def test_a_page_gets_a_token_only_with_its_lease(cloud: Cloud, anna: Person, robot: Robot) -> None:
     control = {"purpose": "control", "device": robot.device, "epoch": 1}
-    refused = anna.post("/xmpp/credentials", control)
+    post = signed_in_page(cloud, "anna")
+    refused = post("/xmpp/credentials", control)
     assert (refused.status_code, refused.json()["type"]) == (409, "/problems/lease-lost")
-    bert = cloud.sign_in("bert")
-    assert bert.post("/xmpp/credentials", control).status_code == 404
-    lease = anna.post(f"/devices/{robot.device}/lease").json()
-    issued = anna.post("/xmpp/credentials", {**control, "epoch": lease["epoch"]})
+    assert signed_in_page(cloud, "bert")("/xmpp/credentials", control).status_code == 404
+    lease = post(f"/devices/{robot.device}/lease", {}).json()
+    issued = post("/xmpp/credentials", {**control, "epoch": lease["epoch"]})
     assert issued.status_code == 200, issued.text
     assert issued.headers["cache-control"] == "no-store"
     body = issued.json()
@@ -130,6 +140,12 @@ def test_a_page_gets_a_token_only_with_its_lease(cloud: Cloud, anna: Person, rob
     assert anna.get(f"/devices/{robot.device}").json()["setpoints_over"] == ["mqtt", "xmpp"]
     view = anna.post("/xmpp/credentials", {"purpose": "view"}).json()
     assert (view["token"], view["websocket_url"]) == ("", "")
+
+
+def test_an_access_token_does_not_renew_itself(anna: Person, robot: Robot) -> None:
+    lease = anna.take_lease(robot.device).json()
+    request = {"purpose": "control", "device": robot.device, "epoch": lease["epoch"]}
+    assert "cannot renew itself" in problem(anna.post("/xmpp/credentials", request), 403, "forbidden")["detail"]
 
 
 def test_an_account_with_many_agents_gets_all_as_contacts(

@@ -66,7 +66,7 @@ export class StopSwitch {
     this.#author = author;
     let wasClear = true;
     const clearError = effect(() => {
-      const clear = this.state.value.kind === "clear";
+      const clear = !device.stopped.value && !device.stopPending.value && !device.stopFaulty.value;
       // An error of the reset is no longer true once the robot reports that it is not stopped.
       if (clear && !wasClear) queueMicrotask(() => (this.#error.value = null));
       wasClear = clear;
