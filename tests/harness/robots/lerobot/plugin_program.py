@@ -39,11 +39,16 @@ robot = make(config_class.get_choice_class("telescope")(id="test", device=device
 opened: list[dict[str, Any]] = []
 if period_s := os.environ.get("RENEW_PERIOD_S"):
     # Renews all credentials in each period, and counts those for setpoints as ``opened``.
-    from lerobot_robot_telescope import client
+    from lerobot_robot_telescope import client  # type: ignore[import-not-found]
 
     client.RENEW_S, client.RENEW_AFTER = float(period_s), 0.0
     open_control = client.Device._open_control
-    client.Device._open_control = lambda used, lease: (open_control(used, lease), opened.append(lease))
+
+    def counted(used: Any, lease: dict[str, Any]) -> None:
+        open_control(used, lease)
+        opened.append(lease)
+
+    client.Device._open_control = counted
 for line in sys.stdin:
     method, *given = json.loads(line)
     try:

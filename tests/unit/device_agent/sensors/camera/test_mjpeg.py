@@ -187,7 +187,7 @@ def test_a_camera_with_a_malformed_challenge_is_a_fault(
     camera.authentication = "malformed"
     driver = create("mjpeg", url=camera.url(), user=USER, password_file=str(secret))
     assert "requires an unsupported kind of authentication" in failure(driver)
-    assert driver._reader._thread.responsive  # type: ignore[attr-defined]
+    assert driver._reader._thread.responsive  # type: ignore[union-attr]
 
 
 def test_a_redirect_to_another_host_is_not_followed(create: CreateDriver, camera: MjpegCamera, secret: Path) -> None:
