@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 # The machine's Node.js if it is new enough, else the one from a Python wheel.
 NODE_READY = command -v npm >/dev/null && node -e 'process.exit(parseInt(process.versions.node) >= 20 ? 0 : 1)'
-NODE = PATH="$(if $(wildcard $(BIN)/npm),$(CURDIR)/$(BIN):)$$PATH" npm
+NODE = PATH="$$({ $(NODE_READY); } 2>/dev/null || printf %s '$(CURDIR)/$(BIN):')$$PATH" npm
 NPM = $(NODE) --prefix web
 
 PIP_OPTIONS := --quiet --disable-pip-version-check --no-deps --require-hashes
@@ -19,12 +19,14 @@ PYTEST := tests/mounted-root $(BIN)/python -m pytest
 SEED ?= $(shell git rev-parse --short HEAD 2>/dev/null || echo 0)
 SAMPLE = $(PYTEST) -q -m "not long" --sample $(SEED)
 SECONDS_EACH ?= 60
-# Most tests wait for child processes, so three workers share two cores. The tests of one file stay in one worker.
-PARALLEL = -n 3 --dist loadfile --no-loadscope-reorder
+# Many tests wait for child processes, so four workers share two cores. The tests of one file stay in one worker.
+PARALLEL = -n 4 --dist loadfile --no-loadscope-reorder
 # Two workers: two browsers and two products use two cores fully.
 BROWSERS = -n 2 --dist loadscope tests/e2e
-# These tests measure a moving robot or need a response within a deadline, so they run one at a time.
-SERIAL = tests/api tests/faults tests/security/tenants/test_secrets.py
+# These tests measure or record a moving robot, or need a response within a deadline, so they run one at a time.
+SERIAL = tests/api tests/faults tests/security/tenants/test_secrets.py tests/e2e/operate/test_recorded_session.py \
+	tests/e2e/rooms/test_recorded_cameras.py
+IGNORE_SERIAL = $(SERIAL:%=--ignore %)
 
 .PHONY: docs help up link env console test test-fast test-long bench bench-quick soak coverage fuzz mutation check check-python check-web audit-packages contract requirements \
 	system-packages test-environment wheels agent-bundle clean
@@ -133,6 +135,25 @@ tests/harness/identity_provider/node_modules/.installed: tests/harness/identity_
 	@$(call install,requirements/lerobot.txt,.venv/lerobot/bin/python)
 	@touch $@
 
+# The newest LeRobot needs Python 3.12 or 3.13. A machine without them tests only the other version, and no datasets.
+# `lerobot-dataset` has its loader of datasets with PyTorch, 1.6 GB.
+.venv/.lerobot-new: requirements/lerobot-new.txt
+.venv/.lerobot-dataset: tests/contract/exports/requirements.txt
+.venv/.lerobot-new .venv/.lerobot-dataset: .venv/.%: | .venv/.python
+	@rm -rf .venv/$*
+	@for python in $(PYTHON) python3.13 python3.12 $${PYENV_ROOT:-$$HOME/.pyenv}/versions/3.1[23].*/bin/python; do \
+		$$python -c 'import sys; sys.exit(not (3, 12) <= sys.version_info < (3, 14))' 2>/dev/null || continue; \
+		$$python -m venv --without-pip .venv/$* || exit; \
+		$(call install,$<,.venv/$*/bin/python); exit; \
+	done; echo "telescope: no Python 3.12 or 3.13, so $* is not tested" >&2
+	@touch $@
+
+# Rerun, 520 MB, for one long test. The packages that it needs are in the environment.
+.venv/.rerun: tests/contract/exports/rerun.txt | .venv/.dev
+	@rm -rf .venv/rerun
+	@$(PIP) --target .venv/rerun -r tests/contract/exports/rerun.txt
+	@touch $@
+
 console: web/dist/index.html
 
 web/dist/index.html: web/node_modules/.installed web/index.html web/package.json $(wildcard web/*.ts web/public/*) $(shell find web/src -type f 2>/dev/null)
@@ -152,20 +173,20 @@ test-environment: system-packages
 	@$(MAKE) --no-print-directory -j 3 test-packages
 
 test-packages: .venv/.dev console tests/harness/azurite/node_modules/.installed tests/harness/identity_provider/node_modules/.installed \
-	.venv/.azure-worker .venv/.naoqi .venv/.lerobot
+	.venv/.azure-worker .venv/.naoqi .venv/.lerobot .venv/.lerobot-new
 
 test: test-environment
 	@$(MAKE) --no-print-directory -j 2 check-python check-web
 	@$(MAKE) --no-print-directory coverage
-	@$(SAMPLE) $(PARALLEL) --ignore tests/unit/device_agent --ignore tests/e2e $(SERIAL:%=--ignore %)
-	@$(SAMPLE) $(BROWSERS)
+	@$(SAMPLE) $(PARALLEL) --ignore tests/unit/device_agent --ignore tests/e2e $(IGNORE_SERIAL)
+	@$(SAMPLE) $(BROWSERS) $(IGNORE_SERIAL)
 	@$(SAMPLE) $(SERIAL)
 
 # Rules of the agent and the server without brokers, databases, browsers and physics.
 test-fast: .venv/.dev
 	@$(PYTEST) -q -m "not long and not slow" -n 2 tests/unit
 
-test-long: test-environment check coverage
+test-long: test-environment .venv/.rerun .venv/.lerobot-dataset check coverage
 	@$(PYTEST)
 
 # Every branch of the agent's runtime is covered by the agent's unit tests alone.

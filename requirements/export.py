@@ -16,6 +16,9 @@ EXPORTS = {
     "requirements/agent.txt": ("agent", "sim", "xmpp", "ros"),
     "requirements/agent-build.txt": ("agent-build",),
     "requirements/lerobot.txt": ("lerobot",),
+    "requirements/lerobot-new.txt": ("lerobot-new",),
+    "tests/contract/exports/requirements.txt": ("lerobot-dataset",),
+    "tests/contract/exports/rerun.txt": ("rerun",),
     "requirements/local.txt": ("local",),
     "requirements/naoqi.txt": ("naoqi",),
     "requirements/node.txt": ("node",),
@@ -28,10 +31,13 @@ EXPORTS = {
 }
 OPTIONS = {
     "requirements/azure-worker.txt": ("--no-deps", "--python-version", "3.13"),
+    "requirements/lerobot-new.txt": ("--python-version", "3.12"),
+    "tests/contract/exports/requirements.txt": ("--python-version", "3.12"),
+    "tests/contract/exports/rerun.txt": ("--no-deps",),
     "requirements/mutation.txt": ("--constraint", "requirements/dev.txt"),
 }
-"""Extra options of ``uv pip compile``. The Functions worker runs beside packages that are installed already. Packages
-for mutation testing are installed beside those of ``dev``."""
+"""Extra options of ``uv pip compile``. The Functions worker and Rerun run beside packages that are installed already.
+Packages for mutation testing are installed beside those of ``dev``."""
 EXCLUDED = "sys_platform == 'never'"
 """Marker with which ``pyproject.toml`` leaves out a package that another one requests and does not need."""
 HEADER = "# Exported from pyproject.toml by `make requirements`: groups {}.\n"

@@ -15,6 +15,7 @@ from tests.harness.browser.robots import SIMULATED, Robot, real_robot
 LABORATORY = {
     "test_health_pages",
     "test_keyframes",
+    "test_live_sensors",
     "test_robot_actions",
     "test_room_devices",
     "test_room_pages",

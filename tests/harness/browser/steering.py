@@ -28,7 +28,8 @@ def operator(browser: Browser, machine: Machine, robot: str = "UR5") -> Iterator
 
 def open_robot(page: Page, robot: str = "UR5") -> None:
     """Open a robot's page from the device list."""
-    page.get_by_test_id("device-row").filter(has_text=robot).get_by_role("link").first.click()
+    # By its link: the row of another robot may contain the name in its type.
+    page.get_by_test_id("device-row").get_by_role("link", name=robot).first.click()
     expect(page.get_by_test_id("control-state")).to_be_visible()
 
 
