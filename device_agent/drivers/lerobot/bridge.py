@@ -35,8 +35,8 @@ _TICKS = 4096  # of a turn
 _MAX_LINE = 65536
 _HISTORY = 100
 
-UNUSED = ("cv2", "lerobot.processor", "lerobot.utils.utils")
-"""Modules that LeRobot imports with its robot classes, for cameras and training. They need packages of 5 GB."""
+UNUSED = ("cv2", "lerobot.lerobot_types", "lerobot.processor", "lerobot.utils.device_utils", "lerobot.utils.utils")
+"""Modules that LeRobot 0.4 or 0.6 imports with its robot classes, for cameras and training. They need 5 GB."""
 _LOST = (ConnectionError, RuntimeError, ValueError, TypeError, LookupError)
 """What LeRobot and the libraries of the servos raise if a response is missing or wrong."""
 _FAILED = (*_LOST, OSError, termios.error)  # also if the port is gone
@@ -73,7 +73,8 @@ class Robot:
                 )
             )
         except ImportError as error:
-            raise RobotError(f"LeRobot is not complete ({error}); install requirements/lerobot.txt") from error
+            raise RobotError(f"LeRobot is not complete ({error}); see docs/robots/lerobot.md") from error
+        self.robot.config.num_read_retries = 0  # LeRobot 0.6 takes a late response for that of a repeated request
         self.bus = self.robot.bus
         self.port: str = config["port"]
         self.registers: dict[str, str] = config["registers"]
@@ -87,8 +88,7 @@ class Robot:
         self._twist = [0.0, 0.0, 0.0]
         self._pending = False
         self._moved_s = self._drove_s = -math.inf
-        self._holding = True
-        self._stopped = False
+        self._holding, self._stopped = True, False
         self._tries = _TRIES
         self._markers = itertools.cycle(range(10, 90, 4))
         self._values: list[float] = []

@@ -17,11 +17,11 @@ from device_agent.drivers.lerobot.driver import LerobotDriver, LerobotMobileDriv
 from device_agent.ports.driver import DriverError, MobileDriver, Twist, UnreachableError
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
-from tests.harness.paths import LEROBOT_PYTHON, ROBOTS
+from tests.harness.paths import LEROBOT_PYTHON, LEROBOT_PYTHONS, ROBOTS
 from tests.harness.robots.lerobot.peer import CENTER, TICKS, ServoPeer
-from tests.harness.robots.lerobot.robot_types import lekiwi
 
 SO101 = robot_type.load(ROBOTS / "so101")
+LEKIWI = robot_type.load(ROBOTS / "lekiwi")
 NAMES = [joint.name for joint in SO101.joints]
 HOME = tuple(SO101.home_rad[name] for name in NAMES)
 PAN, GRIPPER = NAMES.index("shoulder_pan"), NAMES.index("gripper")
@@ -35,7 +35,7 @@ def until(condition: Callable[[], object], within_s: float = 60.0) -> None:
 
 
 def create(peer: ServoPeer, kind: RobotType = SO101, **options: str) -> LerobotDriver:
-    driver = load("lerobot")(kind, ROBOTS / "so101", {**peer.options(), **options}, "arm")
+    driver = load("lerobot")(kind, ROBOTS / kind.type, {**peer.options(), **options}, "arm")
     assert isinstance(driver, LerobotDriver)
     return driver
 
@@ -134,11 +134,10 @@ def test_a_port_that_another_program_uses_is_described(peer: ServoPeer) -> None:
 
 
 def test_joints_of_another_robot_are_described(peer: ServoPeer) -> None:
-    kind = lekiwi()
     with pytest.raises(UnreachableError, match="joints of the robot type must be: shoulder_pan, shoulder_lift"):
-        create(peer, kind).connect()
+        create(peer, LEKIWI).connect()
     with pytest.raises(UnreachableError, match="both have a base, or none"):
-        create(peer, msgspec.structs.replace(SO101, base=kind.base)).connect()
+        create(peer, msgspec.structs.replace(SO101, base=LEKIWI.base)).connect()
 
 
 def test_a_missing_interpreter_or_library_is_described(peer: ServoPeer) -> None:
@@ -234,9 +233,8 @@ def test_a_hung_bridge_is_a_lost_device_and_is_replaced(driver: LerobotDriver) -
 
 @pytest.fixture
 def mobile(tmp_path: Path) -> Iterator[tuple[LerobotMobileDriver, ServoPeer]]:
-    kind = lekiwi()
-    peer = ServoPeer(kind, "lekiwi", LEROBOT_PYTHON, tmp_path)
-    driver = load("lerobot")(kind, ROBOTS / "so101", peer.options(), "kiwi")
+    peer = ServoPeer(LEKIWI, "lekiwi", LEROBOT_PYTHON, tmp_path)
+    driver = create(peer, LEKIWI)
     assert isinstance(driver, LerobotMobileDriver)
     driver.connect()
     yield driver, peer
@@ -255,7 +253,7 @@ def test_the_base_moves_in_all_directions(mobile: tuple[LerobotMobileDriver, Ser
             return tuple(peer.base_twist()) == pytest.approx(tuple(twist), abs=5e-3)
 
         until(moves)
-    assert driver.drive(Twist(9.0)) == Twist(0.3)
+    assert driver.drive(Twist(9.0)) == Twist(0.2)
 
 
 def test_the_base_stops_if_only_the_arm_is_commanded(mobile: tuple[LerobotMobileDriver, ServoPeer]) -> None:
@@ -314,8 +312,9 @@ def test_lost_responses_are_shown_while_the_robot_continues(peer: ServoPeer, dri
 
 
 @pytest.mark.parametrize("robot", ["so101_follower", "koch_follower"])
-def test_late_responses_are_not_taken_for_others(robot: str, tmp_path: Path) -> None:
-    peer = ServoPeer(SO101, robot, LEROBOT_PYTHON, tmp_path)
+@pytest.mark.parametrize("version", LEROBOT_PYTHONS, ids="lerobot-{}".format)
+def test_late_responses_are_not_taken_for_others(robot: str, version: str, tmp_path: Path) -> None:
+    peer = ServoPeer(SO101, robot, LEROBOT_PYTHONS[version], tmp_path)
     driver = create(peer)
     seen: set[object] = set()
     try:
@@ -334,10 +333,10 @@ def test_late_responses_are_not_taken_for_others(robot: str, tmp_path: Path) -> 
             return connection.status.lost if connection.status else 0.0
 
         for _ in range(8):  # each time the responses to another request may be late
-            lost = next_status()
-            peer.state(late=True)
-            while next_status() <= lost:
-                pass
+            before_lost, lost = 1.0, next_status()
+            while lost <= before_lost:  # losses of a busy machine leave the statistics meanwhile
+                peer.state(late=True)
+                before_lost, lost = lost, next_status()
             for _ in range(3):
                 next_status()
         assert seen == set()
