@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from device_agent.ports.sensor import Frame, SensorError
-from device_agent.protocol.camera_frames import MAX_JPEG_BYTES
+from device_agent.protocol.camera_frames import MAX_CONTENT_BYTES
 from device_agent.sensors.camera.decoder import END, HEADER, REASONS
 from device_agent.sensors.camera.reader import RejectedError
 
@@ -36,7 +36,7 @@ class DecoderSource:
 
     def frames(self) -> Iterator[Frame]:
         """See ``FrameSource``."""
-        settings = {**self._settings(), "max_bytes": MAX_JPEG_BYTES}
+        settings = {**self._settings(), "max_bytes": MAX_CONTENT_BYTES}
         try:
             # Libraries print addresses with passwords to the error output.
             process = subprocess.Popen(  # noqa: S603 (this interpreter and a program of the agent)
@@ -70,7 +70,7 @@ class DecoderSource:
     def _received(self, output: IO[bytes]) -> Iterator[Frame]:
         while len(header := output.read(HEADER.size)) == HEADER.size:
             kind, taken_s, width, height, length = HEADER.unpack(header)
-            content = output.read(min(length, MAX_JPEG_BYTES))
+            content = output.read(min(length, MAX_CONTENT_BYTES))
             if kind == END:
                 raise self._error(content.decode("ascii", "replace"))
             if len(content) < length:

@@ -4,9 +4,11 @@ import threading
 from typing import NoReturn
 
 from device_agent.ports.sensor import Capture, Frame, SensorError, Values
+from device_agent.protocol import camera_frames
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.camera.options import Timing
 from device_agent.sensors.camera.reader import CameraReader, FrameSource
+from device_agent.sensors.frames import check_kinds
 
 _EARLY = 0.9
 """A frame may follow this share of a period after the previous one, as cameras do not keep their rate exactly."""
@@ -23,7 +25,7 @@ class CameraDriver:
         timing: Rate and maximum age of frames.
 
     Raises:
-        SensorError: The device has streams or controls, or not exactly one camera stream.
+        SensorError: The device has streams or controls, or not exactly one colour camera.
     """
 
     def __init__(self, device: RoomDeviceManifest, source: FrameSource, timing: Timing) -> None:
@@ -32,6 +34,7 @@ class CameraDriver:
                 f"'{device.name}': driver '{device.driver}' has one camera in `cameras`, and only 'image' in "
                 "`captures`; remove other streams, captures and controls"
             )
+        check_kinds(device, (camera_frames.COLOUR,))
         self._device = device
         self._source = source
         self._timing = timing

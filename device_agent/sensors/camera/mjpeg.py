@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.parse import SplitResult
 
 from device_agent.ports.sensor import Frame, RoomDriver, SensorError, Surroundings
-from device_agent.protocol.camera_frames import MAX_JPEG_BYTES, jpeg_size
+from device_agent.protocol.camera_frames import MAX_CONTENT_BYTES, jpeg_size
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.camera.driver import CameraDriver
 from device_agent.sensors.camera.http_client import CameraClient, failure
@@ -73,7 +73,7 @@ class MjpegSource:
         self._client.abort()
 
     def _stream(self, response: HTTPResponse, content_type: str) -> Iterator[Frame]:
-        parser = MultipartParser(boundary_of(content_type), MAX_JPEG_BYTES)
+        parser = MultipartParser(boundary_of(content_type), MAX_CONTENT_BYTES)
         while data := response.read1(_CHUNK_BYTES):
             taken_s = time.monotonic()
             for part in parser.feed(data):
@@ -83,10 +83,10 @@ class MjpegSource:
         period_s = 1 / self._options.rate_hz
         while True:
             taken_s = time.monotonic()
-            content = response.read(MAX_JPEG_BYTES + 1)
-            if len(content) > MAX_JPEG_BYTES:
+            content = response.read(MAX_CONTENT_BYTES + 1)
+            if len(content) > MAX_CONTENT_BYTES:
                 raise SensorError(
-                    f"{shown(self._address)}: a picture has more than {MAX_JPEG_BYTES // 1000} KB; choose a lower "
+                    f"{shown(self._address)}: a picture has more than {MAX_CONTENT_BYTES // 1000} KB; choose a lower "
                     "resolution or quality in the camera"
                 )
             self._client.close()

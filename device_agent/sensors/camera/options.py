@@ -75,9 +75,19 @@ def parse(options: Mapping[str, Any], kind: type[Options], *, driver: str, devic
 
 
 def with_files(camera: Camera, folder: Path) -> Camera:
-    """The options with the paths of their files, which are relative to ``folder``."""
+    """The options with the paths of their files, which are relative to ``folder``.
+
+    Raises:
+        SensorError: A path begins with the home of a user who does not exist.
+    """
     files = {name: getattr(camera, name) for name in ("password_file", "ca") if getattr(camera, name, "")}
-    return replace(camera, **{name: str(folder / Path(path).expanduser()) for name, path in files.items()})
+    paths = {}
+    for name, path in files.items():
+        try:
+            paths[name] = str(folder / Path(path).expanduser())
+        except RuntimeError as error:
+            raise SensorError(f"option '{name}': the user in the path does not exist; write the whole path") from error
+    return replace(camera, **paths)
 
 
 def split_address(url: str, schemes: tuple[str, ...]) -> SplitResult:

@@ -59,6 +59,7 @@ class MqttDevice(ConfiguredDevice, ABC):
         self._broker: HomeBroker | None = None
         self.changed = threading.Condition()
         self.inbox = SampleInbox()
+        self.state_missing = False
         self._reported: dict[str, object] = {}
         self._present: dict[str, object] = {}
 
@@ -149,7 +150,10 @@ class MqttDevice(ConfiguredDevice, ABC):
 
     @abstractmethod
     def on_message(self, topic: str, payload: bytes, *, retained: bool) -> None:
-        """Process a message. Called with the lock of ``changed``."""
+        """Process a message. Called with the lock of ``changed``.
+
+        It sets ``state_missing`` if the device has returned, so that its state must be requested.
+        """
 
     @abstractmethod
     def problem(self) -> str:
@@ -277,6 +281,10 @@ class MqttDevice(ConfiguredDevice, ABC):
         with self.changed:
             self.on_message(topic, payload, retained=retained)
             self.changed.notify_all()
+            request, self.state_missing = self.state_missing, False
+        if request:
+            with contextlib.suppress(SensorError):  # lost again: the next connection requests it
+                self.on_connected()
 
 
 def stepped(raw: float, step: float) -> int | float:

@@ -3,7 +3,6 @@
 Topics and messages: https://tasmota.github.io/docs/MQTT/ and https://tasmota.github.io/docs/Commands/
 """
 
-import contextlib
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -183,9 +182,7 @@ class TasmotaDevice(MqttDevice):
             self._available = payload == b"Online"
             if not self._available:
                 self.forget_values()
-            elif returned:
-                with contextlib.suppress(SensorError):  # lost again: the next connection repeats it
-                    self.on_connected()
+            self.state_missing |= self._available and returned
             return
         if retained:
             return  # of unknown age

@@ -1,7 +1,7 @@
 """Base class of simulated room devices: options, controls, access to the world."""
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -11,6 +11,7 @@ from device_agent.ports.driver import DriverError
 from device_agent.ports.sensor import Capture, Image, Scan, SensorError, Values
 from device_agent.ports.simulation import SimulatedWorld
 from device_agent.protocol.manifests.room import Control, RoomDeviceManifest
+from device_agent.sensors.frames import check_kinds
 from device_agent.sensors.mujoco.shared_view import view_of
 
 _KINDS = {
@@ -36,7 +37,11 @@ class SimulatedSensor:
     OPTIONS: Mapping[str, type | tuple[type, ...]] = {}
     """Additional options: name → type."""
 
+    FRAMES: Collection[str] = ()
+    """Kinds of frames for viewers."""
+
     def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
+        check_kinds(device, self.FRAMES)
         self._device = device
         self._world = world
         self._life = threading.Lock()

@@ -10,10 +10,13 @@ import simplejpeg
 
 from device_agent.ports.sensor import Bytes, Capture, Depths, Frame, Image, SensorError
 from device_agent.ports.simulation import SimulatedWorld
+from device_agent.protocol import camera_frames
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors import png
+from device_agent.sensors.frames import declared_camera, depth_capture, depth_frame, people_frame
 from device_agent.sensors.mujoco.base import SimulatedSensor
 from device_agent.sensors.mujoco.noise import generator
+from device_agent.sensors.mujoco.people_tracker import CameraPose, PeopleTracker
 from device_agent.simulation.renderer import Renderer, renderer_of
 
 FRESH_S = 0.1
@@ -25,8 +28,6 @@ _GRAIN = 1.5
 _TILES = 64
 """Noise is generated once, larger than the image by this in each direction, and shifted randomly per image."""
 _NEAREST_M, _FURTHEST_M = 0.3, 8.0
-_MILLIMETRE = 0.001
-_FAR_MM = 65_535
 
 
 class Camera(SimulatedSensor):
@@ -102,7 +103,9 @@ class Camera(SimulatedSensor):
 
 
 class ColourCamera(Camera):
-    """Frames on ``cam/{name}``; capture ``image``: a lossless PNG."""
+    """Frames of the kind ``colour``; capture ``image``: a lossless PNG."""
+
+    FRAMES = (camera_frames.COLOUR,)
 
     def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         super().__init__(device, world)
@@ -111,9 +114,7 @@ class ColourCamera(Camera):
 
     def frame(self, camera: str) -> Frame:
         """See ``ports.sensor.Camera``."""
-        cameras = [known.name for known in self._device.cameras]
-        if camera not in cameras:
-            self._reject_unknown("camera", camera, cameras)
+        declared_camera(self._device, camera)
         image = self._take()
         content = simplejpeg.encode_jpeg(image.rgb, quality=_QUALITY, colorsubsampling="420")
         return Frame(self._width, self._height, content, image.taken_s)
@@ -130,7 +131,9 @@ class ColourCamera(Camera):
 
 
 class DepthCamera(Camera):
-    """Distances for ``raw``; capture ``depth``: a 16-bit PNG in millimetres, 0 without a reading.
+    """Frames of the kind ``depth`` and capture ``depth``: a 16-bit PNG in millimetres, 0 without an echo.
+
+    Frames of the kind ``people``: see ``people_tracker``.
 
     Noise of structured light: standard deviation 1.2 mm + 1.9 mm/m² (z - 0.4 m)², from Nguyen, Izadi and Lovell,
     "Modeling Kinect Sensor Noise for Improved 3D Reconstruction and Tracking", 2012.
@@ -144,6 +147,7 @@ class DepthCamera(Camera):
         "furthest_m": (int, float),
     }
     DEPTH = True
+    FRAMES = (camera_frames.DEPTH, camera_frames.PEOPLE)
 
     def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         super().__init__(device, world)
@@ -151,17 +155,45 @@ class DepthCamera(Camera):
         self._furthest_m = float(self.option("furthest_m", _FURTHEST_M))
         noise = self._random.normal(0.0, 1.0, (self._height + _TILES, self._width + _TILES))
         self._noise = noise.astype(np.float32)
+        self._tracker: PeopleTracker | None = None
+
+    def on_connect(self, model: Any) -> None:
+        """See ``SimulatedSensor``."""
+        super().on_connect(model)
+        own_body = int(model.cam_bodyid[self._camera]) or -1  # the walls belong to body 0
+        self._tracker = PeopleTracker(model, random=self._random, noise_m=_deviation, own_body=own_body)
+
+    def frame(self, camera: str) -> Frame:
+        """See ``ports.sensor.Camera``."""
+        if declared_camera(self._device, camera).kind == camera_frames.DEPTH:
+            return depth_frame(self.raw())  # shared with perception
+        return self._track_people()
+
+    def _track_people(self) -> Frame:
+        self.require()
+        tracker, high = self._tracker, math.tan(self._fovy_rad / 2)
+        if tracker is None:
+            raise SensorError(f"'{self._device.name}' is not connected")
+        with self.view.current() as (data, taken_s):
+            position_m = data.cam_xpos[self._camera].copy()
+            rotation = data.cam_xmat[self._camera].reshape(3, 3).copy()
+            pose = CameraPose(position_m, rotation, (high * self._width / self._height, high))
+            people = tracker.track(data, pose)
+        return people_frame(people, taken_s=taken_s, position_m=position_m, rotation=rotation, fovy_rad=self._fovy_rad)
 
     def capture(self, name: str) -> Capture:
         """See ``RoomDriver``."""
         if name not in self._device.captures:
             return super().capture(name)
-        depth_m = np.nan_to_num(np.asarray(self._take().depth_m), posinf=0.0)
-        millimetres = np.rint(depth_m / _MILLIMETRE)
-        return Capture("image/png", png.encode(np.clip(millimetres, 0, _FAR_MM).astype(np.uint16)))
+        return depth_capture(np.asarray(self._take().depth_m))
 
     def _measure(self, pixels: Any) -> tuple[Bytes | None, Depths | None]:
-        deviation = np.float32(0.0012) + np.float32(0.0019) * np.square(pixels - np.float32(0.4))
-        depth_m = pixels + self._shifted(self._noise) * deviation
+        depth_m = pixels + self._shifted(self._noise) * _deviation(pixels)
         depth_m[(pixels < self._nearest_m) | (pixels > self._furthest_m)] = np.inf
         return None, depth_m
+
+
+def _deviation(depth_m: Any) -> Any:
+    """Standard deviation of structured light at a depth [m], in the precision of the argument."""
+    one = depth_m.dtype.type
+    return one(0.0012) + one(0.0019) * np.square(depth_m - one(0.4))

@@ -7,9 +7,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from device_agent.ports.sensor import Capture, Floats, Scan, Values
+from device_agent.ports.sensor import Capture, Floats, Frame, Scan, Values
 from device_agent.ports.simulation import SimulatedWorld
+from device_agent.protocol import camera_frames
 from device_agent.protocol.manifests.room import RoomDeviceManifest
+from device_agent.sensors.frames import declared_camera
 from device_agent.sensors.mujoco.base import SimulatedSensor
 from device_agent.sensors.mujoco.noise import generator
 
@@ -25,7 +27,7 @@ class Lidar(SimulatedSensor):
     """Beams in the x-y plane of a site; its own body is invisible to it.
 
     Stream ``range``: the smallest distance in each of eight sectors, ``range_m.0`` to the left of the site's x axis;
-    ``furthest_m`` without a hit. Capture ``scan``: all beams, JSON.
+    ``furthest_m`` without a hit. Frames of the kind ``scan`` and capture ``scan``: all beams, JSON.
 
     Options: ``site``, its name in the model (default: the device's name); ``beams``; ``nearest_m``, ``furthest_m``.
     """
@@ -36,6 +38,8 @@ class Lidar(SimulatedSensor):
         "nearest_m": (int, float),
         "furthest_m": (int, float),
     }
+
+    FRAMES = (camera_frames.SCAN,)
 
     def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         super().__init__(device, world)
@@ -88,6 +92,11 @@ class Lidar(SimulatedSensor):
             return super().read(stream)
         nearest = (float(sector.min()) for sector in np.array_split(self.raw().range_m, _SECTORS))
         return {f"range_m.{index}": round(min(each, self._furthest_m), 4) for index, each in enumerate(nearest)}
+
+    def frame(self, camera: str) -> Frame:
+        """See ``ports.sensor.Camera``."""
+        declared_camera(self._device, camera)
+        return self.raw().frame()
 
     def capture(self, name: str) -> Capture:
         """See ``RoomDriver``."""

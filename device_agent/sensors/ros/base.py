@@ -11,6 +11,7 @@ from device_agent.middleware.ros.messages import Dialect
 from device_agent.ports.driver import UnreachableError
 from device_agent.ports.sensor import Capture, Floats, Image, Scan, SensorError, Values
 from device_agent.protocol.manifests.room import RoomDeviceManifest
+from device_agent.sensors.frames import check_kinds
 from device_agent.sensors.ros.options import Options
 
 _START_S = 3.0
@@ -36,8 +37,11 @@ class RosSensor:
     """Python type of its messages."""
     STREAMS: ClassVar[Sequence[str]] = ()
     CAPTURES: ClassVar[Sequence[str]] = ()
+    FRAMES: ClassVar[Sequence[str]] = ()
+    """Kinds of frames for viewers."""
 
     def __init__(self, device: RoomDeviceManifest, options: Options) -> None:
+        check_kinds(device, self.FRAMES)
         self.device = device
         self.options = options
         self._connection: Connection | None = None

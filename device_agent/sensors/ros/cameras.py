@@ -3,30 +3,26 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import numpy as np
-
 from device_agent.middleware.ros import images
 from device_agent.middleware.ros.images import RawImage
 from device_agent.middleware.ros.messages import CompressedImage
 from device_agent.ports.sensor import Bytes, Capture, Depths, Frame, Image
+from device_agent.protocol import camera_frames
 from device_agent.protocol.camera_frames import jpeg_size
 from device_agent.sensors import png
+from device_agent.sensors.frames import declared_camera, depth_capture, depth_frame
 from device_agent.sensors.ros.base import RosSensor
-
-_MILLIMETRE = 0.001
-_FAR_MM = 65_535
 
 
 class _Camera(RosSensor):
-    """Frames on ``cam/{name}``."""
+    """Frames of the kind ``colour``."""
 
     CAPTURES: ClassVar[Sequence[str]] = ("image",)
+    FRAMES: ClassVar[Sequence[str]] = (camera_frames.COLOUR,)
 
     def frame(self, camera: str) -> Frame:
         """See ``ports.sensor.Camera``."""
-        cameras = [known.name for known in self.device.cameras]
-        if camera not in cameras:
-            self.reject("camera", camera, cameras)
+        declared_camera(self.device, camera)
         message, at_s = self.newest()
         width, height, content = self._jpeg(message)
         return Frame(width, height, content, at_s)
@@ -98,10 +94,15 @@ class CompressedCamera(_Camera):
 
 
 class DepthCamera(_Camera):
-    """Depths with 16UC1 [mm] or 32FC1 [m]. Capture ``depth``: a 16-bit PNG in millimetres, 0 without a measurement."""
+    """Depths with 16UC1 [mm] or 32FC1 [m].
+
+    Frames of the kind ``depth`` and capture ``depth``: a 16-bit PNG in millimetres, 0 without an echo. Frames of the
+    kind ``colour``: depths as grey values.
+    """
 
     TYPE, MESSAGE = "sensor_msgs/Image", RawImage
     CAPTURES = ("depth",)
+    FRAMES = (camera_frames.COLOUR, camera_frames.DEPTH)
 
     def check(self, message: RawImage) -> None:
         """See ``RosSensor``."""
@@ -111,8 +112,13 @@ class DepthCamera(_Camera):
         """See ``RoomDriver``."""
         if name not in self.CAPTURES:
             return super().capture(name)
-        millimetres = np.rint(np.nan_to_num(images.depths(self.newest()[0]), posinf=0.0) / _MILLIMETRE)
-        return Capture("image/png", png.encode(np.clip(millimetres, 0, _FAR_MM).astype(np.uint16)))
+        return depth_capture(images.depths(self.newest()[0]))
+
+    def frame(self, camera: str) -> Frame:
+        """See ``ports.sensor.Camera``."""
+        if declared_camera(self.device, camera).kind == camera_frames.DEPTH:
+            return depth_frame(self.raw())
+        return super().frame(camera)
 
     def _jpeg(self, message: RawImage) -> tuple[int, int, bytes]:
         return images.to_jpeg(images.displayed(images.depths(message)))

@@ -7,17 +7,20 @@ import numpy as np
 from device_agent.middleware.ros import scans
 from device_agent.middleware.ros.scans import LaserScan, PointCloud2
 from device_agent.ports.clock import wall_ms
-from device_agent.ports.sensor import Capture, Scan, Values
+from device_agent.ports.sensor import Capture, Frame, Scan, Values
+from device_agent.protocol import camera_frames
+from device_agent.sensors.frames import declared_camera
 from device_agent.sensors.ros.base import RosSensor
 
 _RANGE = "range"
 
 
 class Lidar(RosSensor):
-    """Stream ``range``: the smallest distance in each of eight sectors. Capture ``scan``: all beams as JSON."""
+    """Stream ``range``: the smallest distance in each of eight sectors. Frames and capture ``scan``: all beams."""
 
     TYPE, MESSAGE = "sensor_msgs/LaserScan", LaserScan
     STREAMS, CAPTURES = (_RANGE,), ("scan",)
+    FRAMES = (camera_frames.SCAN,)
 
     def check(self, message: LaserScan) -> None:
         """See ``RosSensor``."""
@@ -26,6 +29,11 @@ class Lidar(RosSensor):
     def read(self, stream: str) -> Values:
         """See ``RoomDriver``."""
         return scans.sectors(self.newest()[0]) if stream == _RANGE else super().read(stream)
+
+    def frame(self, camera: str) -> Frame:
+        """See ``ports.sensor.Camera``."""
+        declared_camera(self.device, camera)
+        return self.raw().frame()
 
     def capture(self, name: str) -> Capture:
         """See ``RoomDriver``."""

@@ -8,12 +8,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-import simplejpeg
 
 from device_agent.ports.sensor import Camera, Image, Movable, RoomDriver, Scan, SensorError
 from device_agent.protocol import FIELD_PATTERN, MAX_VALUES, Measurements, camera_frames, codec
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.manifests.room import RoomDeviceManifest
+from tests.harness.network.cameras.frames import frame_size
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -78,7 +78,7 @@ class RoomDriverContract:
                 case "application/json":
                     json.loads(taken.content)
 
-    def test_cameras_return_small_jpegs_of_the_stated_size(
+    def test_cameras_return_frames_of_the_declared_kind_and_size(
         self, connected: RoomDriver, entry: RoomDeviceManifest
     ) -> None:
         if entry.cameras:
@@ -86,8 +86,9 @@ class RoomDriverContract:
             for camera in entry.cameras:
                 frame = connected.frame(camera.name)
                 assert frame is not None
-                assert simplejpeg.decode_jpeg(frame.content).shape == (frame.height, frame.width, 3)
-                camera_frames.encode(CameraFrame(1, 1, frame.width, frame.height, frame.content))
+                assert frame.kind == camera.kind
+                assert frame_size(frame) == (frame.width, frame.height)
+                camera_frames.encode(CameraFrame(1, 1, frame.width, frame.height, frame.content, frame.kind))
 
     def test_controls_apply_the_returned_value(self, connected: RoomDriver, entry: RoomDeviceManifest) -> None:
         for control in entry.controls:

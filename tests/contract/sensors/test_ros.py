@@ -14,10 +14,12 @@ import simplejpeg
 from device_agent import sensors
 from device_agent.middleware.ros import images, scans
 from device_agent.ports.sensor import Camera, Image, RoomDriver, Scan, SensorError, Surroundings
-from device_agent.protocol.description import Stream
+from device_agent.protocol.description import CameraStream, Stream
 from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.ros import base
 from tests.contract.sensors.suite import RoomDriverContract
+from tests.harness.network.cameras import frames
+from tests.harness.network.cameras.frames import depths_mm
 from tests.harness.robots.ros import sensors as peers
 from tests.harness.robots.ros.ros_system import ros_system
 from tests.harness.robots.ros.sensors import RosbridgeSensors, as_json, rospy_sensors
@@ -26,8 +28,9 @@ _WAIT_S = 60.0
 
 
 def entry_of(kind: str, **options: object) -> RoomDeviceManifest:
-    cameras = (Stream(name="view", rate_hz=5.0),) if "camera" in kind else ()
-    streams = () if cameras else (Stream(name="range", rate_hz=5.0),)
+    kinds = {"depth_camera": ("colour", "depth"), "lidar": ("scan",), "point_cloud": ()}.get(kind, ("colour",))
+    cameras = tuple(CameraStream(name=each, rate_hz=5.0, kind=each) for each in kinds)
+    streams = () if "camera" in kind else (Stream(name="range", rate_hz=5.0),)
     captures = {"lidar": "scan", "point_cloud": "cloud", "depth_camera": "depth"}
     return RoomDeviceManifest(
         name="sensor", kind=kind, label="Sensor", driver="ros", streams=streams, cameras=cameras,
@@ -115,6 +118,18 @@ def test_scans_pictures_and_clouds_have_the_values_of_their_messages(options: di
     assert isinstance(depth, Image)
     assert depth.depth_m is not None
     assert depth.depth_m[0, :3].tolist() == pytest.approx([math.inf, 0.001, 0.002])
+    for name, kind, expected in (("depth_camera", "depth", peers.DEPTHS_MM), ("lidar", "scan", None)):
+        driver = drivers[name]
+        assert isinstance(driver, Camera)
+        frame = driver.frame(kind)
+        assert frame is not None
+        if expected is not None:
+            assert np.array_equal(depths_mm(frame.content), expected)
+            continue
+        streamed = frames.scan(frame.content)
+        assert streamed.range_m[:4] == (None,) * 4
+        assert streamed.range_m[4:] == pytest.approx(peers.RANGES_M[4:], abs=1e-4)
+        assert streamed.position_m == (1.0, 2.0, 0.5)
     content = json.loads(drivers["point_cloud"].capture("cloud").content)
     assert len(content["points_m"]) == 5000 / 3 // 1 + 1
     assert content["points_m"][0] == pytest.approx(peers.POINTS[0] + [1.0, 2.0, 0.5], abs=1e-3)
@@ -266,7 +281,7 @@ def test_large_jpegs_of_a_camera_are_reduced(peer: RosbridgeSensors) -> None:
     driver = create("compressed_camera", **peer.options)
     driver.connect()
     assert isinstance(driver, Camera)
-    frame = driver.frame("view")
+    frame = driver.frame("colour")
     driver.close()
     assert frame is not None
     assert len(frame.content) <= images.MAX_JPEG

@@ -1,150 +1,151 @@
-import { unavailableReason } from "../devices";
-import type { DeviceStore } from "../devices/model";
+import { frameStream, unavailableReason, useFrames } from "../devices";
+import type { DeviceStore, LatestFrame } from "../devices/model";
 import { Age } from "../../shared/ui/age";
 import { Card } from "../../shared/ui/card";
-import { useEffect, useRef, useState } from "preact/hooks";
+import { useMemo, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
-import { now } from "../../shared/lib/clock";
-import type { RoomDeviceAction } from "./model/room-device-action";
+import { useVisible } from "../../shared/hooks/use-visible";
+import { clock, now } from "../../shared/lib/clock";
 import { readDepth, type DepthImage } from "../../shared/lib/png";
+import { readPeople } from "../../shared/mqtt/sensor-frames";
+import type { RoomDeviceAction } from "./model/room-device-action";
+import { scaleOf, type DepthScale } from "./model/depth-scale";
+import { depthView } from "./model/live-view";
 import { format } from "../../shared/i18n/format";
+import { DepthPicture, Skeletons } from "./depth-picture";
 import { texts } from "./texts";
 import { contentOf } from "./use-capture-content";
-import { falseColour, MISSING_COLOUR } from "../../shared/ui/colour-map";
 
-interface Drawn extends DepthImage {
-  nearM: number;
-  farM: number;
+interface DepthCardProps {
+  device: DeviceStore;
+  /** Takes single images; `null` if unsupported. */
+  roomAction: RoomDeviceAction | null;
+}
+
+interface Captured {
+  image: DepthImage;
   at: number;
 }
 
-interface Point {
-  x: number;
-  y: number;
-}
-
-/** Depth image: near is dark, far is light, out of range is grey. Every point can be read. */
-export function DepthCard({ device, roomAction }: { device: DeviceStore; roomAction: RoomDeviceAction }) {
-  const canvas = useRef<HTMLCanvasElement>(null);
-  const scale = useRef<HTMLCanvasElement>(null);
-  const [drawn, setDrawn] = useState<Drawn | null>(null);
-  const [point, setPoint] = useState<Point | null>(null);
+/** Depth image and tracked people: near is dark, far is light, out of range is grey. The page subscribes while visible. */
+export function DepthCard({ device, roomAction }: DepthCardProps) {
+  const box = useRef<HTMLDivElement>(null);
+  const visible = useVisible(box);
+  const [running, setRunning] = useState(false);
+  const [captured, setCaptured] = useState<Captured | null>(null);
   const [error, setError] = useState("");
+  const [depth, people] = [frameStream(device, "depth"), frameStream(device, "people")];
+  const active = running && visible;
+  const live = useFrames(device, "depth", depth?.name ?? null, active, readDepth);
+  const tracked = useFrames(device, "people", people?.name ?? null, active, readPeople);
+
+  // The last image stays after the end of the subscription, marked as old and with its age.
+  const last = useRef<LatestFrame<DepthImage> | null>(null);
+  last.current = live.latest ?? last.current;
+  const image = last.current;
+  const shown = captured ?? (image === null ? null : { image: image.value, at: image.at });
+  const scale = useScale(shown?.image ?? null, captured === null);
+  const latest = depth === null ? tracked.latest : image;
+  const { stalled, overlay } = depthView(
+    running && captured === null,
+    depth === null ? null : { latest: image, rateHz: depth.rate_hz },
+    people === null ? null : { latest: tracked.latest, rateHz: people.rate_hz },
+    clock.value,
+  );
+  const old = stalled || !device.live.value || (latest !== null && captured === null && !running);
 
   const capture = async (): Promise<void> => {
-    const file = await roomAction.capture("depth");
-    if (file === null) return;
+    const file = await roomAction?.capture("depth");
+    if (file === null || file === undefined) return;
     try {
-      const image = await readDepth(await contentOf(file));
-      const distances = image.depthM.filter((m) => m > 0).sort();
-      const [nearM, farM] = [distances[0] ?? 0, distances.at(-1) ?? 1];
-      setDrawn({ ...image, nearM: Math.floor(nearM * 10) / 10, farM: Math.ceil(farM * 10) / 10, at: now() });
+      setCaptured({ image: await readDepth(await contentOf(file)), at: now() });
+      setRunning(false);
       setError("");
     } catch (error) {
       setError(sentence(error));
     }
   };
-
-  useEffect(() => {
-    if (drawn === null || canvas.current === null || scale.current === null) return;
-    paint(canvas.current, drawn);
-    paintScale(scale.current);
-  }, [drawn]);
-
-  const move = (event: KeyboardEvent): void => {
-    const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-    if (drawn === null || step === undefined) return;
-    event.preventDefault();
-    const by = event.shiftKey ? 1 : 8;
-    const from = point ?? { x: Math.floor(drawn.width / 2), y: Math.floor(drawn.height / 2) };
-    const within = (value: number, most: number): number => Math.min(most - 1, Math.max(0, value));
-    const [right = 0, down = 0] = step;
-    setPoint({ x: within(from.x + right * by, drawn.width), y: within(from.y + down * by, drawn.height) });
-  };
-
-  const aim = (event: PointerEvent): void => {
-    if (drawn === null || !(event.currentTarget instanceof HTMLElement)) return;
-    const box = event.currentTarget.getBoundingClientRect();
-    const at = (share: number, most: number): number => Math.min(most - 1, Math.max(0, Math.floor(share * most)));
-    setPoint({
-      x: at((event.clientX - box.left) / box.width, drawn.width),
-      y: at((event.clientY - box.top) / box.height, drawn.height),
-    });
+  const toggle = (): void => {
+    setCaptured(null);
+    setRunning(!running);
   };
 
   const unavailable = unavailableReason(device);
-  const busy = roomAction.busy.value !== null;
+  const busy = roomAction !== null && roomAction.busy.value !== null;
+  const messages = [roomAction?.error.value ?? "", error, running ? live.error : "", running ? tracked.error : ""].filter((one) => one !== "");
+  const caption = (age: string): string => {
+    if (shown === null) return "";
+    const { width, height } = shown.image;
+    return (captured === null ? texts.depth.received : texts.depth.captured)(width, height, age);
+  };
   return (
-    <Card title={texts.depth.title} class="picture">
-      <div class={`depth-box ${device.live.value ? "" : "old"}`}>
-        {drawn === null ? (
-          <p class="over quiet">{texts.depth.none}</p>
-        ) : (
-          <div
-            class="depth-picture"
-            role="img"
-            tabIndex={0}
-            aria-label={texts.depth.label(format.oneDigit(drawn.nearM), format.oneDigit(drawn.farM))}
-            onPointerMove={aim}
-            onPointerDown={aim}
-            onKeyDown={move}
-          >
-            <canvas ref={canvas} width={drawn.width} height={drawn.height} data-testid="depth-picture" />
-            {point !== null && (
-              <span class="crosshair" style={{ left: percent(point.x + 0.5, drawn.width), top: percent(point.y + 0.5, drawn.height) }} />
-            )}
+    <Card title={depth === null && people !== null ? texts.people.title : texts.depth.title} class="picture">
+      <div ref={box} class={`depth-box ${old ? "old" : ""}`}>
+        {shown !== null && scale !== null ? (
+          <DepthPicture drawn={{ image: shown.image, scale, sequence: image?.sequence ?? 0 }} people={overlay} />
+        ) : overlay !== null && depth === null ? (
+          <div class="depth-picture people-only">
+            <Skeletons people={overlay} width={320} height={240} />
           </div>
+        ) : (
+          <p class="over quiet">{running ? texts.depth.waiting : depth === null && people === null ? texts.depth.none : texts.depth.off}</p>
+        )}
+        {stalled && latest !== null && (
+          <p class="tag" role="status">
+            <Age at={latest.at} as={texts.camera.stalled} />
+          </p>
         )}
       </div>
-      {drawn !== null && (
-        <div class="depth-scale">
-          <span>{texts.depth.read(format.oneDigit(drawn.nearM))}</span>
-          <canvas ref={scale} width={256} height={1} aria-hidden="true" />
-          <span>{texts.depth.read(format.oneDigit(drawn.farM))}</span>
-          <output class="depth-value" data-testid="depth-value">
-            {point === null ? format.unknown : reading(drawn, point)}
-          </output>
-        </div>
-      )}
-      {drawn !== null && (
+      {shown !== null && (
         <p class="quiet small">
           {texts.depth.hint} {texts.depth.noReading}
         </p>
       )}
+      {people !== null && (
+        <p class="small" role="status" data-testid="tracked-people" data-people={overlay?.people.length ?? ""}>
+          {overlay === null ? <span class="quiet">{texts.people.key}</span> : texts.people.count(overlay.people.length)}
+          {overlay !== null && overlay.people.length > 0 && <span class="quiet"> {texts.people.key}</span>}
+        </p>
+      )}
       <div class="row">
-        <button type="button" class="primary" data-testid="depth-shot" disabled={unavailable !== "" || busy} title={unavailable} onClick={() => void capture()}>
-          {busy ? texts.camera.taking : drawn === null ? texts.depth.shot : texts.depth.again}
-        </button>
+        {(depth !== null || people !== null) && (
+          <button type="button" class={running ? "" : "primary"} data-testid="depth-live" aria-pressed={running} onClick={toggle}>
+            {running ? texts.depth.stop : texts.depth.start}
+          </button>
+        )}
+        {roomAction !== null && (
+          <button
+            type="button"
+            class={depth === null ? "primary" : ""}
+            data-testid="depth-shot"
+            disabled={unavailable !== "" || busy}
+            title={unavailable}
+            onClick={() => void capture()}
+          >
+            {busy ? texts.camera.taking : captured === null ? texts.depth.shot : texts.depth.again}
+          </button>
+        )}
         <span class="quiet small">
-          {drawn !== null && <Age at={drawn.at} as={(age) => texts.depth.captured(drawn.width, drawn.height, age)} />}
+          {running && live.latest !== null && !stalled
+            ? texts.camera.live(live.latest.value.width, live.latest.value.height, format.oneDigit(live.latest.rateHz), format.upToOneDigit(depth?.rate_hz ?? 0))
+            : shown !== null && <Age at={shown.at} as={caption} />}
         </span>
       </div>
-      {roomAction.error.value !== "" && <p class="notice bad">{roomAction.error.value}</p>}
-      {error !== "" && <p class="notice bad">{error}</p>}
+      {messages.map((message) => (
+        <p key={message} class="notice bad">
+          {message}
+        </p>
+      ))}
     </Card>
   );
 }
 
-function percent(value: number, of: number): string {
-  return `${(100 * value) / of}%`;
-}
-
-function reading({ depthM, width }: Drawn, { x, y }: Point): string {
-  const m = depthM[y * width + x] ?? 0;
-  return m > 0 ? texts.depth.read(m.toFixed(2)) : texts.depth.outOfRange;
-}
-
-function paint(canvas: HTMLCanvasElement, { width, height, depthM, nearM, farM }: Drawn): void {
-  const image = new ImageData(width, height);
-  depthM.forEach((m, index) => {
-    const [red, green, blue] = m > 0 ? falseColour((m - nearM) / Math.max(0.001, farM - nearM)) : MISSING_COLOUR;
-    image.data.set([red, green, blue, 255], index * 4);
-  });
-  canvas.getContext("2d")?.putImageData(image, 0, 0);
-}
-
-function paintScale(canvas: HTMLCanvasElement): void {
-  const image = new ImageData(canvas.width, 1);
-  for (let x = 0; x < canvas.width; x += 1) image.data.set([...falseColour(x / (canvas.width - 1)), 255], x * 4);
-  canvas.getContext("2d")?.putImageData(image, 0, 0);
+/** The colour scale of an image; that of a live image follows the previous one. */
+function useScale(image: DepthImage | null, live: boolean): DepthScale | null {
+  const previous = useRef<DepthScale | null>(null);
+  return useMemo(() => {
+    if (image === null) return null;
+    previous.current = scaleOf(image, live ? previous.current : null) ?? { nearM: 0, farM: 1 };
+    return previous.current;
+  }, [image, live]);
 }

@@ -1,6 +1,12 @@
 import { type Extent, type Floor } from "./model/room-perception";
 import { colour } from "../../shared/ui/canvas-theme";
+import { bonesOf } from "../../shared/lib/skeleton";
+import type { KnownPerson } from "../../shared/mqtt/sensor-frames";
 import type { Trail } from "./floor-plan";
+import type { LiveSensors } from "./model/sightings";
+
+/** Radius of the circle around a tracked person [m]. */
+const PERSON_M = 0.35;
 
 export function paint(
   context: CanvasRenderingContext2D,
@@ -9,6 +15,7 @@ export function paint(
   room: Extent,
   floor: Floor | null,
   trails: ReadonlyMap<string, Trail>,
+  seen: LiveSensors,
 ): void {
   const scale = width / (room.highX - room.lowX);
   const x = (m: number): number => (m - room.lowX) * scale;
@@ -26,6 +33,37 @@ export function paint(
     context.stroke();
   });
   context.globalAlpha = 1;
+  // A light edge, because most echoes are on occupied cells.
+  for (const [name, side] of [["--surface", 5], ["--series-2", 3]] as const) {
+    context.fillStyle = colour(name);
+    for (const [east, north] of seen.echoes) context.fillRect(x(east) - side / 2, y(north) - side / 2, side, side);
+  }
+  for (const person of seen.people) paintPerson(context, person, x, y, scale);
+}
+
+/** A tracked person from above: a circle and the bones, dashed where the sensor infers them. */
+function paintPerson(
+  context: CanvasRenderingContext2D,
+  person: KnownPerson,
+  x: (m: number) => number,
+  y: (m: number) => number,
+  scale: number,
+): void {
+  const [east, north] = person.position_m;
+  context.strokeStyle = colour("--text");
+  context.lineWidth = 1.5;
+  context.beginPath();
+  context.arc(x(east), y(north), PERSON_M * scale, 0, 2 * Math.PI);
+  context.stroke();
+  context.lineWidth = 2;
+  for (const { from, to, tracked } of bonesOf(person)) {
+    context.setLineDash(tracked ? [] : [2, 3]);
+    context.beginPath();
+    context.moveTo(x(from[0]), y(from[1]));
+    context.lineTo(x(to[0]), y(to[1]));
+    context.stroke();
+  }
+  context.setLineDash([]);
 }
 
 function paintFloor(

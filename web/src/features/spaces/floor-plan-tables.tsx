@@ -9,13 +9,16 @@ import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { deviceAddress } from "../../shared/routing/routes";
+import type { LiveSensors } from "./model/sightings";
 import { RANGE, type MountedDevice, deviceOf, nameOf } from "./floor-plan";
 
-export function Legend() {
+export function Legend({ seen }: { seen: LiveSensors }) {
   return (
     <ul class="plan-key quiet small">
       <li class="key-taken">{texts.plan.key.taken}</li>
       <li class="key-unknown">{texts.plan.key.unknown}</li>
+      {seen.echoes.length > 0 && <li class="key-echo">{texts.plan.key.echo}</li>}
+      {seen.people.length > 0 && <li class="key-person">{texts.plan.key.person}</li>}
       <li class="key-metre">{texts.plan.metre}</li>
     </ul>
   );

@@ -14,6 +14,9 @@ import { onColourChange } from "../../shared/ui/canvas-theme";
 import "./floor-plan.css";
 import { Legend, OccupantTable, MountedDeviceList } from "./floor-plan-tables";
 import { paint } from "./floor-plan-canvas";
+import { NOTHING_SEEN, type LiveSensors } from "./model/sightings";
+import { useLiveSensors } from "./use-live-sensors";
+import { useVisible } from "../../shared/hooks/use-visible";
 
 const POSITIONS = "positions";
 
@@ -79,10 +82,12 @@ export function FloorPlan({ fleet, space, agent }: PlanProps) {
   const { devices, perception, mounted, places, floor, extent: shownExtent, old, receivedAt } = useFloorPlan(fleet, space, agent);
   const late = perception?.late(POSITIONS) === true;
   const waiting = receivedAt === null && floor === null;
+  const part = useRef<HTMLDivElement>(null);
+  const seen = useLiveSensors(devices, useVisible(part));
   return (
-    <Card title={texts.plan.title} class="plan" aside={<Legend />}>
+    <Card title={texts.plan.title} class="plan" aside={<Legend seen={seen} />}>
       <div class="plan-parts">
-        <div class="plan-part">
+        <div ref={part} class="plan-part">
       {shownExtent === null ? (
         <p class="quiet">{perception === null ? texts.plan.empty : texts.plan.waiting}</p>
       ) : (
@@ -93,6 +98,7 @@ export function FloorPlan({ fleet, space, agent }: PlanProps) {
           mounted={mounted}
           devices={devices}
           trails={perception}
+          seen={seen}
           old={old}
           receivedAt={receivedAt}
         />
@@ -139,6 +145,7 @@ interface DrawingProps {
   devices: readonly DeviceStore[];
   /** The device whose positions have trails. */
   trails: DeviceStore | null;
+  seen?: LiveSensors;
   old: boolean;
   receivedAt: number | null;
   target?: { xM: number; yM: number; yawRad: number | null } | null;
@@ -148,7 +155,7 @@ interface DrawingProps {
 
 export type Trail = { at: number; x: number; y: number }[];
 
-export function Drawing({ extent: room, floor, places, mounted, devices, trails, old, receivedAt, target, onPick }: DrawingProps) {
+export function Drawing({ extent: room, floor, places, mounted, devices, trails, seen = NOTHING_SEEN, old, receivedAt, target, onPick }: DrawingProps) {
   const canvas = useRef<HTMLCanvasElement>(null);
   const box = useRef<HTMLDivElement>(null);
   const [width, setWidth] = useState(0);
@@ -168,8 +175,8 @@ export function Drawing({ extent: room, floor, places, mounted, devices, trails,
   }, []);
   useEffect(() => {
     if (canvas.current === null) return;
-    return canvasBox(canvas.current, (context, widthPx, heightPx) => paint(context, widthPx, heightPx, room, floor, trail.current));
-  }, [room, floor, places, repaint]);
+    return canvasBox(canvas.current, (context, widthPx, heightPx) => paint(context, widthPx, heightPx, room, floor, trail.current, seen));
+  }, [room, floor, places, seen, repaint]);
 
   const pins = useMemo(() => {
     if (width === 0) return [];
@@ -195,9 +202,11 @@ export function Drawing({ extent: room, floor, places, mounted, devices, trails,
       class={`plan-box ${old ? "old" : ""}`}
       style={{ aspectRatio: `${widthM} / ${heightM}` }}
       role="group"
-      aria-label={texts.plan.label(places.length)}
+      aria-label={texts.plan.label(places.length, seen.people.length)}
       data-testid="plan"
       data-places={places.length}
+      data-echoes={seen.echoes.length}
+      data-people={seen.people.length}
       data-floor={floor === null ? "" : `${floor.columns}x${floor.rows}`}
     >
       <canvas ref={canvas} aria-hidden="true" />
