@@ -1,7 +1,8 @@
 """Render a robot type's scene: ``python robots/render.py ur5 docs/pictures/ur5.png``.
 
 The robot is at home by default. Pose it with ``joint=position`` [rad], ``--expression happy``, ``--posture Sit`` or
-``--viseme aa``. The default camera is the scene's ``render``; ``--camera`` selects another.
+``--viseme aa``, and place an object of the scene with ``object=x,y,z`` [m]. The default camera is the scene's
+``picture``; ``--camera`` selects another.
 
 Contact sheets: ``--turntable`` shows the robot from all sides, ``--all expressions`` all expressions of the manifest.
 
@@ -64,10 +65,11 @@ class SceneRenderer:
             sys.exit(f"{self.manifest.type} has no '{name}' in {kind}; available: {', '.join(poses) or 'none'}")
         return dict(poses[name])
 
-    def pose(self, position_rad: Mapping[str, float]) -> None:
-        """Set joint positions; other joints are at home."""
+    def pose(self, position_rad: Mapping[str, float | Sequence[float]]) -> None:
+        """Set joint positions, or x, y, z [m] of objects; other joints are at home."""
         for joint, position in (self.manifest.home_rad | dict(position_rad)).items():
-            self.data.joint(joint).qpos[0] = position
+            values = np.atleast_1d(position)
+            self.data.joint(joint).qpos[: len(values)] = values
         self._equality_joints.apply(self.data.qpos)
         mujoco.mj_forward(self.model, self.data)
 
@@ -111,11 +113,12 @@ def main() -> None:
     single = not (arguments.turntable or arguments.all)
     width, height = (WIDTH, HEIGHT) if single else (TILE, TILE)
     with SceneRenderer(types[arguments.type], width, height) as scene:
-        position_rad: dict[str, float] = {}
+        position_rad: dict[str, float | Sequence[float]] = {}
         for kind in POSES:
             name = getattr(arguments, kind.removesuffix("s"))
             position_rad |= scene.joints_of(kind, name) if name else {}
-        position_rad |= {joint: float(at) for joint, _, at in (text.partition("=") for text in arguments.position)}
+        for joint, _, at in (text.partition("=") for text in arguments.position):
+            position_rad[joint] = [float(value) for value in at.split(",")]
         scene.pose(position_rad)
         if arguments.turntable:
             image = sheet([scene.render(scene.orbit_camera(2 * math.pi * view / VIEWS)) for view in range(VIEWS)])

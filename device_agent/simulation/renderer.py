@@ -32,7 +32,7 @@ TIMEOUT_S = 5.0
 _RESPONSE_S = 15.0
 """A frame that is not rendered within this time is abandoned."""
 _MAX_GEOMS = 5000
-_CHANGING = ("light_diffuse", "light_ambient", "light_active", "geom_rgba", "mat_rgba")
+_CHANGING = ("light_diffuse", "light_ambient", "light_active", "geom_rgba", "geom_size", "geom_rbound", "mat_rgba")
 """Model fields that a process of the world may change at runtime."""
 _NICE = 5
 """Rendering has a lower priority than stepping the world. Under heavy load the laboratory world lost 0.6 and 0.9 s of

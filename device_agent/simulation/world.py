@@ -46,8 +46,10 @@ class World:
     """A scene and the robots placed in it.
 
     ``open`` and ``close`` count users: the first ``open`` compiles the model and starts real time, the last ``close``
-    stops it, and a later ``open`` resumes. In tests, call ``build`` and then ``step``; equal commands then give equal
-    numbers.
+    stops it, and a later ``open`` resumes. Without real time, call ``step``; equal commands then give equal numbers.
+
+    Attributes:
+        scene: MJCF file of the scene.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class World:
         home: Mapping[str, float] | None = None,
         settings: Mapping[str, float] | None = None,
         trace: Path | None = None,
+        real_time: bool = True,
     ) -> None:
         """Describe a world; no file is read before ``build`` or ``open``.
 
@@ -67,8 +70,9 @@ class World:
             home: Full joint name → start position [rad or m]; other joints start at the model's reference.
             settings: Initial settings of the room.
             trace: File for the ground truth, see ``Trace``.
+            real_time: Whether ``open`` starts real time. Otherwise time passes in ``step`` only.
         """
-        self._scene = scene
+        self.scene = scene
         self._robots = tuple(robots)
         self._home = dict(home or {})
         self._trace_files: dict[Path, str] = {} if trace is None else {trace: ""}
@@ -78,6 +82,7 @@ class World:
         self._start = dict(settings or {})
         self._settings = dict(self._start)
         self._sounds: dict[str, tuple[float, float]] = {}
+        self._real_time = real_time
         self._users = 0
         self._life = threading.Lock()  # guards starting and stopping only
         self._thread: SupervisedThread | None = None
@@ -102,7 +107,7 @@ class World:
         """
         with self._life:
             self.build()
-            if self._thread is None:
+            if self._thread is None and self._real_time:
                 self._start_thread()
             self._users += 1
 
@@ -123,8 +128,8 @@ class World:
             return
         # Otherwise MuJoCo writes warnings to a file in the working folder.
         mujoco.set_mju_user_warning(_warn)
-        model = assemble(self._scene, self._robots)
-        data = home_state(model, self._home, self._start, scene=self._scene)
+        model = assemble(self.scene, self._robots)
+        data = home_state(model, self._home, self._start, scene=self.scene)
         self._addresses = {
             model.joint(index).name: int(model.jnt_qposadr[index])
             for index in range(model.njnt)
@@ -149,7 +154,7 @@ class World:
             time_s = self.snapshot().time_s
             self._ramps.clear()
             self._settings = dict(self._start)
-            self._data = home_state(self._model, self._home, self._start, scene=self._scene)
+            self._data = home_state(self._model, self._home, self._start, scene=self.scene)
             self._data.time = time_s  # simulated time never decreases
             self._fault = ""
             self._publish()

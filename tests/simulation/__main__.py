@@ -7,6 +7,9 @@ import time
 from tests.simulation import planted, runs
 from tests.simulation.plan import create
 
+PROGRESS = 500
+"""Seeds between two lines of progress."""
+
 
 def main() -> int:
     """Run simulations. Returns 1 if a promise was broken."""
@@ -51,6 +54,9 @@ def _search(first: int, count: int, defect: str) -> int:
                 print(f"found with seed {outcome.seed}, the {number}. of {count}")
                 outcomes.close()
                 return 1
+        if number % PROGRESS == 0:
+            rate = number / (time.monotonic() - started_s)
+            print(f"{number} of {count} seeds, {failed} failed, {rate:.1f} seeds per second", flush=True)
     elapsed_s = time.monotonic() - started_s
     print(f"{count} seeds, {failed} failed, {count / elapsed_s:.1f} seeds per second")
     return 1 if failed else 0

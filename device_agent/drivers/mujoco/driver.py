@@ -19,11 +19,15 @@ from device_agent.ports.sensor import Frame
 from device_agent.ports.skills import Skill, SkillContext, SkillError
 from device_agent.protocol import Pose, SetStiffness, Twin
 from device_agent.protocol.manifests import task_kinds
+from device_agent.protocol.manifests.capabilities import Simulation
 from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.protocol.manifests.tasks import Tasks
 from device_agent.simulation.mjcf import twin
 from device_agent.simulation.mjcf.equality_joints import SCALAR_JOINTS
 from device_agent.simulation.scene_assembly import is_servo
 from device_agent.simulation.snapshot import Floats, Ints, Snapshot
+from device_agent.simulation.tasks import task_observer
+from device_agent.simulation.tasks.task_observer import SimulatedTaskMonitor
 from device_agent.simulation.world import STALE_S, World
 
 log = logging.getLogger(__name__)
@@ -83,8 +87,8 @@ class MujocoDriver:
         self._base_matrix: Floats = np.eye(3)
         self._from_base: Floats = np.eye(4)
         self._ramp_s = RAMP_PERIODS * robot_type.period_ms / 1000
-        battery = None if robot_type.simulation is None else robot_type.simulation.battery
-        self._motors = MotorModel(robot_type.joints, battery, seed=device)
+        simulation = robot_type.simulation or Simulation()
+        self._motors = MotorModel(robot_type.joints, simulation.battery, seed=device, grips=simulation.grips)
         self._fault_injector = FaultInjector(faults, [joint.name for joint in robot_type.joints])
         self._motor_fault: MotorFault | None = None
         self._stiffness: ServoGains | None = None
@@ -192,6 +196,15 @@ class MujocoDriver:
         """Emit speech sound in the simulated room."""
         if self._connected:
             self._world.sound(self._device, SPEECH_DB, for_s=for_s)
+
+    def observe_task(self, manifest: Tasks, task: str) -> SimulatedTaskMonitor:
+        """Observe a task of the scene; see ``ObservesTasks``.
+
+        Raises:
+            DriverError: Not connected, the simulation has stopped, or the scene is not that of the manifest.
+        """
+        self._live()
+        return task_observer.observe(self._world, manifest, task)
 
     def halt(self) -> None:
         """Hold the joints where their motors are commanded now.

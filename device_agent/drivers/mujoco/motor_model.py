@@ -7,7 +7,7 @@ thermal model in a room of 22 °C.
 
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -104,10 +104,14 @@ class MotorModel:
         joints: The robot type's joints.
         battery: The robot type's battery, if any.
         seed: Seed of the sensor noise: the device's name.
+        grips: Joints of fingers, which may stop at an object: they never count as stalled.
     """
 
-    def __init__(self, joints: Sequence[Joint], battery: Battery | None, *, seed: str = "") -> None:
+    def __init__(
+        self, joints: Sequence[Joint], battery: Battery | None, *, seed: str = "", grips: Collection[str] = ()
+    ) -> None:
         self._names = [joint.name for joint in joints]
+        self._may_stall = np.array([joint.name not in grips for joint in joints], dtype=np.bool_)
         self._max_nm = np.array([joint.max_effort_nm for joint in joints])
         self._fastest_rad_s = np.array([joint.max_velocity_rad_s for joint in joints])
         count = len(joints)
@@ -161,7 +165,7 @@ class MotorModel:
             effort_nm: Torque of the joints' motors, shape (n,).
             velocity_rad_s: Joint velocities, shape (n,).
         """
-        at_limit = np.abs(effort_nm) >= _AT_LIMIT * self._max_nm
+        at_limit = self._may_stall & (np.abs(effort_nm) >= _AT_LIMIT * self._max_nm)
         if not at_limit.any():
             self._still_s[:] = 0.0
             return []

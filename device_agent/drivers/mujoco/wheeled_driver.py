@@ -90,12 +90,12 @@ class WheelBrake:
 
     Args:
         actuators: The wheels' actuators.
-        braking_rad_s2: Deceleration.
+        braking: Deceleration, in the unit of the actuators per second.
     """
 
-    def __init__(self, actuators: Ints, braking_rad_s2: float) -> None:
+    def __init__(self, actuators: Ints, braking: float) -> None:
         self._actuators = actuators
-        self._braking_rad_s2 = braking_rad_s2
+        self._braking = braking
         self._now_s = 0.0
         self.driven_s = -math.inf
 
@@ -105,7 +105,7 @@ class WheelBrake:
         elapsed_s, self._now_s = time_s - self._now_s, time_s
         if time_s - self.driven_s > _SILENT_S:
             speeds = data.ctrl[self._actuators]
-            left = np.maximum(np.abs(speeds) - self._braking_rad_s2 * elapsed_s, 0.0)
+            left = np.maximum(np.abs(speeds) - self._braking * elapsed_s, 0.0)
             data.ctrl[self._actuators] = np.copysign(left, speeds)
 
 

@@ -36,7 +36,8 @@ _DELAY_S = 0.1
 _BEHAVIOUR_POLL_S = 0.02
 _BEHAVIOUR_END_S = 8.0
 """Longest time until the robot has ended a behaviour and holds [s]."""
-_ADOPTED_S = 0.5
+_ADOPTED_S = 3.0
+"""Time for the agent's control loop to receive the held position [s]; longer than the time after which it hangs."""
 BEHAVIOUR, SCRIPT = "naoqi", "script"
 """Kinds of the behaviours' names."""
 _RUNNER = Path(__file__).with_name("script_runner.py")

@@ -26,6 +26,12 @@ _LAG_RAD = 0.1
 """Largest distance of a joint that holds from its command [rad]."""
 _BEAT, _ECHO = "Telescope/Beat", "Telescope/Echo"
 """Data of ``ALMemory``: a number that changes while the connection works, and its repetition by the watchdog."""
+_WATCHDOG_PROGRAM = "the program telescope_watchdog.py on the robot"
+_STOPPED = f"{_WATCHDOG_PROGRAM} stopped it: the connection to the robot had failed"
+_UNCONFIRMED = f"{_WATCHDOG_PROGRAM} does not respond, and may have stopped it"
+_ENDED = "it was ended before its own end"
+_ECHO_S = 1.0
+"""Longest time until the watchdog has confirmed that it did not stop a behaviour [s]."""
 _GUARDED_S = 0.25
 """The robot is guarded for this time after an echo [s]."""
 _SENSOR = "Device/SubDeviceList/{}/{}/Value"
@@ -66,10 +72,13 @@ class Robot:
         self._stop: Any = None
         self._stop_is_last = False
         self._ending: Any = None  # event of the running behaviour or script that ends it
-        self._beats = itertools.cycle(range(1, 1 << 30))
+        self._why = ""  # why the event was set
+        self._beats = itertools.count(1)
+        self._sent = 0
         self._beat: Any = None
         self._echo: Any = None
         self._echoed: Any = None
+        self._stops: list[int] | None = None  # how often the watchdog has stopped the robot; empty if it does not count
         self._guarded_s = -math.inf
         self._closing = False  # the connection is ended: no more beats
         call(self.motion.setMoveArmsEnabled, False, False)  # the agent moves the arms, also while the robot walks
@@ -106,12 +115,20 @@ class Robot:
         if self._closing or is_running(self._beat) or is_running(self._echo):
             return
         if self._echo is not None and not self._echo.hasError():
-            echo = self._echo.value()
-            if self._echoed not in (None, echo):  # the first one may be that of an earlier connection
-                self._guarded_s = time.monotonic()
-            self._echoed = echo
-        self._beat = self.memory.insertData(_BEAT, next(self._beats), _async=True)
+            self._accept_echo(self._echo.value())
+        self._sent = next(self._beats)
+        self._beat = self.memory.insertData(_BEAT, self._sent, _async=True)
         self._echo = self.memory.getData(_ECHO, _async=True)
+
+    def _accept_echo(self, echo: Any) -> None:
+        """``echo``: a repeated beat, and the count of stops, which earlier versions of the watchdog do not send."""
+        number, *stops = echo if isinstance(echo, (list, tuple)) else [echo]
+        if self._echoed not in (None, number):  # the first one may be that of an earlier connection
+            self._guarded_s = time.monotonic()
+            if self._stops not in (None, stops):
+                self.end_behaviour(_STOPPED)
+            self._stops = stops
+        self._echoed = number
 
     def move_joints(self, angles: list[float | None]) -> None:
         """Move those joints that have an angle; none while the robot moves itself."""
@@ -142,7 +159,7 @@ class Robot:
             if self.walks and now_s - self._walked_s > WATCHDOG_S:
                 self._stop_walk()
             if now_s - self._moved_s > WATCHDOG_S:
-                self.end_behaviour()
+                self.end_behaviour(f"the agent sent no commands for {WATCHDOG_S} s")
                 self._hold_joints()
 
     def hold(self, *, for_good: bool = False) -> None:
@@ -217,21 +234,40 @@ class Robot:
         with self._lock:
             if self._held or self._ending is not None:
                 return "the robot is busy or was halted", []
-            self._ending = ending = threading.Event()
+            self._ending, self._why = threading.Event(), ""
+            ending = self._ending
+            self._moved_s = time.monotonic()  # the task is a command: the agent must send the next one in time
+            stops = self._stops if self.guarded else None
         try:
             error = self._run_script(task, ending) if "script" in task else self._run_behaviour(task, ending)
         except (RuntimeError, OSError) as failure:
             error = str(failure) or "the robot does not respond"
         held = self.end_motion()
+        error = error or self._watchdog_report(stops) or self._why or ("" if held else _ENDED)
         with self._lock:
             self._ending = None
-        return error or ("" if held and not ending.is_set() else "it was ended before its own end"), held
+        return error, held
 
-    def end_behaviour(self) -> None:
+    def end_behaviour(self, why: str = _ENDED) -> None:
         """Let a running behaviour or script end. Never blocks."""
         ending = self._ending
-        if ending is not None:
+        if ending is not None and not ending.is_set():
+            self._why = why
             ending.set()
+
+    def _watchdog_report(self, stops: list[int] | None) -> str:
+        """What the watchdog did to a behaviour, which continues on the robot after a stop; empty if nothing.
+
+        ``stops``: its count when the behaviour began; ``None`` if it did not run.
+        """
+        number, end_s = self._sent, time.monotonic() + _ECHO_S
+        while stops is not None and not self._held and not self._closing:
+            if self._echoed > number:
+                return _STOPPED if self._stops != stops else ""
+            if time.monotonic() > end_s:
+                return _UNCONFIRMED
+            time.sleep(_CHECK_S / 4)
+        return ""
 
     def _run_behaviour(self, task: dict[str, Any], ending: Any) -> str:
         name = task["behaviour"]

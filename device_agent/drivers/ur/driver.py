@@ -13,7 +13,7 @@ from device_agent.drivers.ur.behaviours import UrBehaviours
 from device_agent.drivers.ur.connection import Connection, Measurement
 from device_agent.drivers.ur.dashboard import Dashboard
 from device_agent.drivers.ur.gripper import Gripper
-from device_agent.drivers.ur.outputs import IO, SETTINGS, UrOutputs
+from device_agent.drivers.ur.outputs import GRIPPER, IO, SETTINGS, UrOutputs
 from device_agent.drivers.ur.starter import ProgramStarter
 from device_agent.ports.driver import DriverError, DriverFault, Observation, UnreachableError
 from device_agent.ports.skills import BehaviourContext, RobotBehaviour, SkillError
@@ -163,10 +163,10 @@ class UrDriver:
         return applied
 
     def report(self, stream: str) -> Mapping[str, float | bool]:
-        """``health``: temperatures of the joints [°C], torques as a share of their maximum; ``io``; ``settings``."""
+        """``health``: temperatures of the joints [°C], share of their torques; and the streams of ``UrOutputs``."""
         connection = self._connection
         newest = None if connection is None else connection.newest
-        if newest is None or stream not in {HEALTH, IO, SETTINGS}:
+        if newest is None or stream not in {HEALTH, IO, SETTINGS, GRIPPER}:
             return {}
         if stream != HEALTH:
             return self._outputs.report(stream, newest)

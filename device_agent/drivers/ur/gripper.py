@@ -18,8 +18,8 @@ _POLL_S = 0.02
 _FULL = 255
 _ACTIVE = 3
 """Value of STA: the gripper is activated."""
-_MOVING = 0
-"""Value of OBJ: the fingers move. Others: they hold an object, or have reached the position."""
+_MOVING, _OBJECTS = 0, (1, 2)
+"""Values of OBJ: the fingers move; an object has stopped them. The other value: they have reached the position."""
 
 
 class Gripper:
@@ -41,6 +41,15 @@ class Gripper:
         """
         with self._open() as link:
             return link.get("POS") / _FULL
+
+    def holds(self) -> bool:
+        """Whether an object has stopped the fingers.
+
+        Raises:
+            SkillError: The gripper does not respond.
+        """
+        with self._open() as link:
+            return link.get("OBJ") in _OBJECTS
 
     def move(self, closed: float, context: BehaviourContext) -> float:
         """Move the fingers, until they have arrived or hold an object; returns the measured position, 0 to 1.

@@ -17,6 +17,7 @@ OUTPUTS: Mapping[str, tuple[str, int, int]] = {
 IO, SETTINGS = "io", "settings"
 """Streams: inputs and outputs; values that can be set."""
 GRIPPER = "gripper"
+"""Control, and stream: how far it is closed and whether it holds an object."""
 _CONFIRM_S = 1.0
 _POLL_S = 0.01
 
@@ -59,7 +60,7 @@ class UrOutputs:
         return float(bool(on))
 
     def report(self, stream: str, newest: Measurement) -> Mapping[str, float | bool]:
-        """Values of ``IO`` or ``SETTINGS``.
+        """Values of ``IO``, ``SETTINGS`` or ``GRIPPER``.
 
         Raises:
             DriverError: The gripper does not respond.
@@ -71,12 +72,17 @@ class UrOutputs:
                 values[f"input.{name}"] = bool(newest.inputs >> bit & 1)
             analog = {f"tool_analog.{number}": value for number, value in enumerate(newest.tool_analog)}
             return {**values, **analog, "tool_voltage_v": float(newest.tool_voltage_v)}
-        settings: dict[str, float | bool] = {
-            name: float(newest.outputs >> OUTPUTS[name][2] & 1) for name in self._names
-        }
-        if self._gripper is not None:
-            try:
-                settings[GRIPPER] = round(self._gripper.closed(), 3)
-            except SkillError as error:
-                raise DriverError(str(error)) from error
-        return settings
+        try:
+            if stream == GRIPPER:
+                return {} if self._gripper is None else _state(self._gripper)
+            settings: dict[str, float | bool] = {
+                name: float(newest.outputs >> OUTPUTS[name][2] & 1) for name in self._names
+            }
+            closed = {} if self._gripper is None else {GRIPPER: round(self._gripper.closed(), 3)}
+        except SkillError as error:
+            raise DriverError(str(error)) from error
+        return {**settings, **closed}
+
+
+def _state(gripper: Gripper) -> Mapping[str, float | bool]:
+    return {"closed": round(gripper.closed(), 3), "holds": gripper.holds()}

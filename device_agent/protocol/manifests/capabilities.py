@@ -101,12 +101,32 @@ class Battery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     idle_w: float
 
 
+class Gripper(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A gripper that operators set from 0 (open) to 1 (closed), and that is not a joint.
+
+    Attributes:
+        actuator: Force-limited position servo of the model, on a joint or a fixed tendon; its range goes from open to
+            closed.
+        speed_m_s: Speed of the servo's target [m/s].
+    """
+
+    actuator: Label
+    speed_m_s: float
+
+
 class Simulation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Data that only a simulation needs. Limits are not among them: they apply to real robots too."""
+    """Data that only a simulation needs. Limits are not among them: they apply to real robots too.
+
+    ``omni_wheels`` names the model's velocity servos of wheels that roll in one direction and slide in the other.
+    ``grips`` names joints of fingers: an object may stop them at full effort, which is not a stall.
+    """
 
     wheels: Wheels | None = None
+    omni_wheels: Annotated[tuple[Label, ...], Meta(min_length=3)] | None = None
     walk: Walk | None = None
     battery: Battery | None = None
+    gripper: Gripper | None = None
+    grips: tuple[Label, ...] = ()
 
 
 class Capabilities(Struct, frozen=True, kw_only=True):
@@ -161,14 +181,21 @@ def _check_simulation(simulation: Simulation, known: Mapping[str, Joint]) -> Non
         ("wheels", simulation.wheels, ("radius_m", "track_m")),
         ("walk", simulation.walk, ("step_s", "lift_m", "support_n", "support_nm")),
         ("battery", simulation.battery, Battery.__struct_fields__),
+        ("gripper", simulation.gripper, ("speed_m_s",)),
     ):
         for field in () if holder is None else fields:
             check_positive(f"simulation.{part}: {field}", getattr(holder, field))
+    if simulation.omni_wheels is not None:
+        if simulation.wheels is not None:
+            raise ProtocolError("simulation: a base has either wheels or omni_wheels")
+        if len(set(simulation.omni_wheels)) < len(simulation.omni_wheels):
+            raise ProtocolError("simulation.omni_wheels: a wheel is named twice")
     if simulation.walk is not None:
         legs = (*simulation.walk.left, *simulation.walk.right)
         check_known("simulation.walk", "joint", legs, known)
         if len(set(legs)) < len(legs):
             raise ProtocolError("simulation.walk: a joint is named twice")
+    check_known("simulation.grips", "joint", simulation.grips, known)
     if simulation.battery is not None and simulation.battery.empty_v > simulation.battery.full_v:
         raise ProtocolError("simulation.battery: empty_v must not be above full_v")
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from device_agent.protocol import Id, Joint, Label, Stream, Text, Vector3, description
+from device_agent.protocol import CameraStream, Id, Joint, Label, Stream, Text, Vector3, camera_frames, description
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import capabilities, toml
 
@@ -123,7 +123,7 @@ class RobotType(capabilities.Capabilities, frozen=True, kw_only=True, forbid_unk
     gaze: Gaze | None = None
     capabilities: tuple[Label, ...] = ()
     streams: tuple[Stream, ...] = ()
-    cameras: Annotated[tuple[Stream, ...], Meta(max_length=4)] = ()
+    cameras: Annotated[tuple[CameraStream, ...], Meta(max_length=4)] = ()
     diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=100)] = ()
 
 
@@ -197,10 +197,15 @@ def _check_figures(robot_type: RobotType) -> None:
     _check_cameras(robot_type.cameras)
 
 
-def _check_cameras(cameras: Sequence[Stream]) -> None:
+def _check_cameras(cameras: Sequence[CameraStream]) -> None:
     if len({camera.name for camera in cameras}) != len(cameras):
         raise ProtocolError("two cameras have the same name")
     for camera in cameras:
+        if camera.kind != camera_frames.COLOUR:
+            raise ProtocolError(
+                f"camera '{camera.name}': kind is '{camera.kind}'; cameras of robots have '{camera_frames.COLOUR}'. "
+                "Describe other sensors as room devices"
+            )
         toml.check_positive(f"rate_hz of camera '{camera.name}'", camera.rate_hz)
         if camera.rate_hz > MAX_CAMERA_HZ:
             raise ProtocolError(

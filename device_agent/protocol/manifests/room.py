@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-from device_agent.protocol import Id, Label, Stream, Text, Vector3, description
+from device_agent.protocol import CameraStream, Id, Label, Stream, Text, Vector3, camera_frames, description
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import toml
 from device_agent.protocol.manifests.robot_type import Diagnostic, RobotType, check_diagnostics
@@ -77,7 +77,7 @@ class RoomDeviceManifest(Struct, frozen=True, kw_only=True, forbid_unknown_field
         label: Display name.
         driver: One of ``device_agent.sensors.names()``.
         streams: Measurement streams with their default rates.
-        cameras: Camera streams with their frame rates.
+        cameras: Streams of frames with their rates and kinds.
         captures: Raw data that can be captured: ``image``, ``scan`` …
         controls: Values that can be set.
         diagnostics: How the cloud evaluates measurements; the first match of a field applies.
@@ -91,7 +91,7 @@ class RoomDeviceManifest(Struct, frozen=True, kw_only=True, forbid_unknown_field
     label: Label
     driver: Id
     streams: Annotated[tuple[Stream, ...], Meta(max_length=16)] = ()
-    cameras: Annotated[tuple[Stream, ...], Meta(max_length=4)] = ()
+    cameras: Annotated[tuple[CameraStream, ...], Meta(max_length=4)] = ()
     captures: Annotated[tuple[Id, ...], Meta(max_length=16)] = ()
     controls: Annotated[tuple[Control, ...], Meta(max_length=16)] = ()
     diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=32)] = ()
@@ -281,6 +281,12 @@ def check_device(device: RoomDeviceManifest) -> None:
         if not 0 < stream.rate_hz <= MAX_RATE_HZ:
             raise ProtocolError(
                 f"rate_hz of stream '{stream.name}' of {where} must be above 0 and at most {MAX_RATE_HZ:g}"
+            )
+    for camera in device.cameras:
+        if camera.kind not in camera_frames.KINDS:
+            raise ProtocolError(
+                f"kind '{camera.kind}' of camera '{camera.name}' of {where} is unknown; use one of: "
+                f"{', '.join(camera_frames.KINDS)}"
             )
     for control in device.controls:
         if not -math.inf < control.lower < control.upper < math.inf:

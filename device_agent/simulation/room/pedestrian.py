@@ -41,6 +41,8 @@ _PATIENCE_S = 3.0
 _ROBOT = "/"
 """Occurs only in body names of robots."""
 _SIDES = (("left", 1.0, 0.0), ("right", -1.0, math.pi))
+LIMBS = tuple(f"{limb}_{side}" for limb in ("thigh", "shin", "arm", "forearm") for side, _, _ in _SIDES)
+"""Suffixes of the bodies of a person's limbs."""
 
 
 @dataclass(slots=True)
@@ -146,8 +148,7 @@ class Pedestrian:
             self._towards = (self._towards + self._direction) % len(self._person.path_m)
 
     def _resolve(self, model: Any) -> None:
-        limbs = [f"{limb}_{side}" for limb in ("thigh", "shin", "arm", "forearm") for side, _, _ in _SIDES]
-        names = [self._person.name, *(f"{self._person.name}_{limb}" for limb in limbs)]
+        names = [self._person.name, *(f"{self._person.name}_{limb}" for limb in LIMBS)]
         mocap = []
         for name in names:
             body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)

@@ -32,7 +32,8 @@ class SimulatedPeer:
     def base_twist(self) -> Twist:
         assert isinstance(self._driver, ReportsStreams)
         self._driver.observe()
-        return Twist(float(self._driver.report("odometry").get("forward_m_s", 0.0)))
+        odometry = self._driver.report("odometry")
+        return Twist(*(float(odometry.get(name, 0.0)) for name in Twist._fields))
 
     def disturb(self, disturbance: Disturbance) -> None:
         raise NotImplementedError(disturbance)

@@ -112,6 +112,16 @@ def test_the_gripper_closes_and_reports_where_it_holds_an_object(driver: UrDrive
     gripper.object_at = 128
     assert driver.set_control("gripper", 1.0, Action()) == pytest.approx(128 / 255)
     assert driver.report("settings")["gripper"] == pytest.approx(128 / 255, abs=1e-3)
+    assert driver.report("gripper") == {"closed": pytest.approx(128 / 255, abs=1e-3), "holds": True}
+    assert driver.set_control("gripper", 0.0, Action()) == 0.0
+    assert driver.report("gripper") == {"closed": 0.0, "holds": False}
+
+
+def test_a_robot_without_a_gripper_has_no_measurement_of_it(peer: UrPeer) -> None:
+    plain = make(peer)
+    plain.connect()
+    assert plain.report("gripper") == {}
+    plain.close()
 
 
 def test_the_end_of_the_action_stops_the_fingers(driver: UrDriver, gripper: GripperServer) -> None:
@@ -133,8 +143,9 @@ def test_a_gripper_that_is_inactive_garbled_or_missing_is_described(driver: UrDr
     with pytest.raises(SkillError, match=r"no response from the gripper .* URCap"):
         driver.set_control("gripper", 1.0, Action())
     gripper.close()
-    with pytest.raises(DriverError, match="no response from the gripper"):
-        driver.report("settings")
+    for stream in ("settings", "gripper"):
+        with pytest.raises(DriverError, match="no response from the gripper"):
+            driver.report(stream)
 
 
 @pytest.mark.parametrize(

@@ -164,7 +164,7 @@ async def report(functions: Functions, action: str, status: AckStatus) -> None:
     at_ms = functions.clock.now_ms()
     ack = Ack(id=action, status=status, sequence=1, at_ms=at_ms, tick_ms=at_ms)
     topic = topics.parse(topics.device("space", agent, name, topics.ACK))
-    await functions.action_acks.ingest(topic, codec.encode(ack))
+    await functions.action_acks.ingest(topic, codec.encode(ack), by="mqtt")
 
 
 CASES: dict[str, tuple[Callable[[Functions], Awaitable[Scene]], Work, int]] = {

@@ -5,6 +5,7 @@ restored, so that the cells of the matrix are independent.
 """
 
 import copy
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ OWNER = "Anneliese Musterfrau"
 LABEL = "Kronjuwel"
 MOVEMENT = "secretdance"
 SOURCE = "'only for permitted accounts'"
+TASK = "red_cube_in_green_tray"
 TABLES_OF_REJECTIONS = {records.ATTEMPTS, records.AUDIT, records.FORGET, records.EVENTS}
 """Tables that record a rejected request. No other table may change."""
 
@@ -93,6 +95,8 @@ def make(memory: Memory) -> World:
     request = _made(other.post(f"/devices/{device}/lease/requests", {"wait_ms": 0}))["request"]["id"]
     _publish_data(cloud, robot, epoch)
     upload = _upload(cloud, anna, device)
+    _record(cloud, anna, robot, epoch)
+    _made(anna.post(f"/robot-types/ur5_gripper/tasks/{TASK}/batches", _batch("geheim")))
     fault = anna.get(f"/devices/{device}/faults").json()["items"][0]["id"]
     ids = {
         "device": device,
@@ -102,10 +106,13 @@ def make(memory: Memory) -> World:
         "request_id": request,
         "fault": fault,
         "upload": upload,
+        "epoch": str(epoch),
         "stream": "hidden",
         "preview": _preview(anna),
         "robot_type": "ur5",
         "name": MOVEMENT,
+        **{f"{name}.robot_type": "ur5_gripper" for name in ("list_tasks", "get_task", "list_trials", "publish_trials")},
+        "task": TASK,
         "get_robot_type_file.name": "ur5.xml",
         "get_device_robot_type_file.name": "ur5.xml",
         "account": people["viewer"].account,
@@ -198,16 +205,41 @@ def _preview(anna: Person) -> str:
 
 
 def _upload(cloud: Cloud, anna: Person, device: str) -> str:
-    begun = _made(
+    started = _made(
         anna.post(
             f"/devices/{device}/uploads",
             {"stream": "camera", "length": 3, "content_type": "image/png", "name": "geheim.png"},
         )
     )
-    put = cloud.request(begun["method"], begun["url"].removeprefix(BASE), headers=begun["headers"], content=b"abc")
+    put = cloud.request(
+        started["method"], started["url"].removeprefix(BASE), headers=started["headers"], content=b"abc"
+    )
     assert put.status_code == 201, put.text
-    _made(anna.post(f"/devices/{device}/uploads/{begun['id']}/complete"))
-    return str(begun["id"])
+    _made(anna.post(f"/devices/{device}/uploads/{started['id']}/complete"))
+    return str(started["id"])
+
+
+def _segment(epoch: int) -> dict[str, Any]:
+    sha256 = hashlib.sha256(b"abc").hexdigest()
+    announced = {"started_ms": 1, "ended_ms": 2, "length": 3, "sha256": sha256}
+    overview = {"overview_length": 3, "overview_sha256": sha256}
+    return {"device": "arm", "epoch": epoch, "segment": 0, **announced, **overview}
+
+
+def _record(cloud: Cloud, anna: Person, robot: Robot, epoch: int) -> None:
+    """Store a recording of the session with one episode."""
+    path = f"/agents/{robot.id}/recordings"
+    started = _made(robot.request("POST", path, json=_segment(epoch)))
+    for name in ("segment", "overview"):
+        request = started[name]
+        url = request["url"].removeprefix(BASE)
+        put = cloud.request(request["method"], url, headers=request["headers"], content=b"abc")
+        assert put.status_code == 201, put.text
+    done = robot.request("POST", f"{path}/complete", json={"device": "arm", "epoch": epoch, "segment": 0})
+    assert done.status_code == 204, done.text
+    episodes = {"episodes": [{"start_s": 0, "end_s": 1, "label": "geheim"}]}
+    path = f"/devices/{robot.device}/sessions/{epoch}/episodes"
+    assert anna.request("PUT", path, json=episodes, headers={"If-Match": '"0"'}).status_code == 200
 
 
 def _bodies(device: str, space: str, epoch: int, introduction: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -230,6 +262,7 @@ def _bodies(device: str, space: str, epoch: int, introduction: dict[str, Any]) -
         "certify": {"request": "x"},
         "claim_agent": {"code": "BCDF-GHJK"},
         "rename_device": {"label": "Elbow grease"},
+        "set_camera_consent": {"cameras": [], "wait_ms": 0},
         "move_agent": {"space": space},
         "post_agent_messages": {"messages": [{"topic": "t", "payload": {}}]},
         "share_device": {"account": "stranger", "role": "operator"},
@@ -260,7 +293,17 @@ def _bodies(device: str, space: str, epoch: int, introduction: dict[str, Any]) -
         "begin_upload": capture,
         "begin_agent_upload": {"device": "arm", **capture},
         "complete_agent_upload": {"device": "arm"},
+        "begin_recording": _segment(epoch),
+        "complete_recording": {"device": "arm", "epoch": epoch, "segment": 0},
+        "set_episodes": {"episodes": []},
+        "publish_trials": _batch("1.0"),
     }
+
+
+def _batch(software: str) -> dict[str, Any]:
+    digest = "0" * 64
+    hashes = {"tasks_sha256": digest, "movement_sha256": digest}
+    return {"first_seed": 0, "trials": 1, "successes": 1, "software": software, "type_version": 1, **hashes}
 
 
 def texts(answer: httpx.Response) -> str:

@@ -37,6 +37,8 @@ class DeviceModel:
         latch_confirmed: Whether a caller received the confirmation of this latch.
         stopped_s: Virtual time of the last period in which the control loop applied the Stop [s].
         starts: Action → number of executions.
+        ending: Action → terminal status that the agent reports. A process that is killed while it reports may have
+            stored it.
         ended: Action → terminal status at the robot.
     """
 
@@ -57,6 +59,7 @@ class DeviceModel:
     running: str = ""
     overlap: tuple[str, float] | None = None
     starts: Counter[str] = field(default_factory=Counter)
+    ending: dict[str, str] = field(default_factory=dict)
     ended: dict[str, str] = field(default_factory=dict)
     issued: dict[str, tuple[int, int]] = field(default_factory=dict)
 
@@ -135,12 +138,16 @@ class RobotChecks:
         """Observe the methods of the runtime within a ``with`` block."""
         undo: list[tuple[type, str, Any]] = []
 
-        def observe(owner: type, name: str, after: Callable[..., None]) -> None:
+        def observe(
+            owner: type, name: str, after: Callable[..., None], before: Callable[..., None] | None = None
+        ) -> None:
             original = getattr(owner, name)
 
             def observed(part: Any, *args: Any, **kwargs: Any) -> Any:
-                result = original(part, *args, **kwargs)
                 model = self._by_part.get(id(part))
+                if model is not None and before is not None:
+                    before(model, *args, **kwargs)
+                result = original(part, *args, **kwargs)
                 if model is not None:
                     after(model, *args, **kwargs)
                 return result
@@ -156,7 +163,7 @@ class RobotChecks:
         observe(Controller, "stop", self._stopped)
         observe(Controller, "record_period", self._period)
         observe(ActionExecutor, "start", self._started)
-        observe(DevicePublisher, "report", self._reported)
+        observe(DevicePublisher, "report", self._reported, self._reporting)
         try:
             yield
         finally:
@@ -241,6 +248,10 @@ class RobotChecks:
         late_ms = self._late_ms(model.name, command.id, command.ttl_ms)
         if late_ms > 0:
             self._violate("after-ttl", model, f"action {_short(command.id)} started {late_ms:.0f} ms after its ttl")
+
+    def _reporting(self, model: DeviceModel, command: str, status: AckStatus, **_: Any) -> None:
+        if status.terminal and command in model.starts:
+            model.ending[command] = status.value
 
     def _reported(self, model: DeviceModel, command: str, status: AckStatus, **fields: Any) -> None:
         if not status.terminal or command not in model.starts:

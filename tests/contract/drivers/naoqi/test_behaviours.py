@@ -37,7 +37,17 @@ WALK = encode("naoqi", "walk")
 
 
 @pytest.fixture
-def agent(make_nao: MakeNao) -> Iterator[ControlThread]:
+def guarded_agent(make_nao: MakeNao) -> Iterator[ControlThread]:
+    """An agent at a robot whose watchdog runs: it may stop a behaviour on a busy machine."""
+    agent = ControlThread(make_nao())
+    yield agent
+    agent.stop()
+
+
+@pytest.fixture
+def agent(nao: NaoPeer, make_nao: MakeNao) -> Iterator[ControlThread]:
+    """An agent at a robot without a watchdog."""
+    nao.end_watchdog()
     agent = ControlThread(make_nao())
     yield agent
     agent.stop()
@@ -103,12 +113,55 @@ def test_a_halt_and_a_hung_agent_end_a_behaviour(agent: ControlThread, nao: NaoP
     until(lambda: nao.state()["running"])
     agent.stop()  # nothing feeds the bridge's watchdog
     thread.join()
-    assert errors == ["it was ended before its own end"]
+    assert errors == ["the agent sent no commands for 0.25 s"]
     assert holds(nao)
 
 
-def test_a_behaviour_of_a_killed_bridge_is_ended_by_the_next_one(agent: ControlThread, nao: NaoPeer) -> None:
+def test_a_behaviour_ends_at_an_agent_that_has_sent_nothing_before_it_either(make_nao: MakeNao, nao: NaoPeer) -> None:
     nao.end_watchdog()
+    driver = make_nao()
+    with pytest.raises(SkillError, match=r"^the agent sent no commands for 0\.25 s$"):
+        driver.run_behaviour(LONG, Action())
+    assert holds(nao)
+
+
+def test_a_behaviour_is_done_while_the_program_on_the_robot_works(guarded_agent: ControlThread) -> None:
+    def done() -> bool:
+        thread, errors = guarded_agent.start(HEY)
+        thread.join()
+        return not errors
+
+    until(done)
+
+
+def test_a_behaviour_that_the_program_on_the_robot_has_stopped_is_not_done(
+    guarded_agent: ControlThread, nao: NaoPeer
+) -> None:
+    thread, errors = guarded_agent.start(LONG)
+    until(lambda: head(nao) > 0.1)
+    nao.state(disturb="beats")
+    start_s = time.monotonic()
+    until(lambda: sum(each > start_s for each in nao.state()["checks"]) > 10)
+    nao.restore()
+    thread.join()
+    assert errors == [
+        "the program telescope_watchdog.py on the robot stopped it: the connection to the robot had failed"
+    ]
+    assert holds(nao)
+
+
+def test_a_behaviour_is_not_done_if_the_program_on_the_robot_does_not_respond_at_its_end(
+    guarded_agent: ControlThread, nao: NaoPeer
+) -> None:
+    thread, errors = guarded_agent.start(HEY)
+    until(lambda: nao.state()["running"])
+    nao.state(disturb="beats")
+    thread.join()
+    nao.restore()
+    assert errors == ["the program telescope_watchdog.py on the robot does not respond, and may have stopped it"]
+
+
+def test_a_behaviour_of_a_killed_bridge_is_ended_by_the_next_one(agent: ControlThread, nao: NaoPeer) -> None:
     thread, errors = agent.start(WALK)
     until(lambda: any(nao.state()["twist"]))
     assert agent.driver._connection is not None
@@ -120,18 +173,18 @@ def test_a_behaviour_of_a_killed_bridge_is_ended_by_the_next_one(agent: ControlT
     until(lambda: holds(nao))
 
 
-def test_the_watchdog_on_the_robot_ends_the_walk_of_a_behaviour(agent: ControlThread, nao: NaoPeer) -> None:
-    thread, errors = agent.start(WALK)
+def test_the_watchdog_on_the_robot_ends_the_walk_of_a_behaviour(guarded_agent: ControlThread, nao: NaoPeer) -> None:
+    thread, errors = guarded_agent.start(WALK)
     until(lambda: any(nao.state()["twist"]))
     time.sleep(0.3)
     assert any(nao.state()["twist"]), "it does not disturb a behaviour while the bridge works"
-    assert agent.driver._connection is not None
-    agent.driver._connection._bridge.process.kill()
+    assert guarded_agent.driver._connection is not None
+    guarded_agent.driver._connection._bridge.process.kill()
     thread.join()
     assert "lost" in errors[0]
     until(lambda: not any(nao.state()["twist"]))
     assert nao.state()["running"], "only the next bridge ends the behaviour"
-    agent.driver.connect()
+    guarded_agent.driver.connect()
     until(lambda: holds(nao))
     assert not nao.state()["running"]
 
@@ -170,7 +223,7 @@ def test_unknown_excluded_and_failing_behaviours_are_described(make_nao: MakeNao
 @pytest.fixture
 def harness(tmp_path: Path, scripts: Path) -> Iterator[tuple[DeviceHarness, NaoPeer]]:
     """A device of the agent at the simulated NAO."""
-    nao = NaoPeer(NAO, NAOQI_PYTHON, simulated=True)
+    nao = NaoPeer(NAO, NAOQI_PYTHON, simulated=True, watchdog=False)
     options = {**nao.options(), "legacy_scripts": True, "scripts": str(scripts)}
     driver = load("naoqi")(NAO, ROBOTS / "nao", options, "arm")
     harness = DeviceHarness(tmp_path, driver=driver, kind=NAO)  # type: ignore[arg-type]

@@ -21,7 +21,9 @@ HEAD = NAMES.index("HeadYaw")
 
 
 @pytest.fixture
-def scripted(make_nao: MakeNao, scripts: Path) -> Iterator[ControlThread]:
+def scripted(nao: NaoPeer, make_nao: MakeNao, scripts: Path) -> Iterator[ControlThread]:
+    """An agent at a robot without a watchdog, which may stop a script on a busy machine."""
+    nao.end_watchdog()
     agent = ControlThread(make_nao(legacy_scripts=True, scripts=str(scripts)))
     yield agent
     agent.stop()

@@ -68,7 +68,7 @@ def test_a_motion_of_the_agent_is_done_after_the_result(driver: RosDriver, peer:
     controller = Controller(TYPE, LeaseGate())
     loop = ControlLoop(
         TYPE, driver, controller, name="arm", publish=lambda _: None, check_interlocks=lambda _: None,
-        load=LoadGovernor(),
+        measure=lambda *_: None, load=LoadGovernor(),
     )  # fmt: skip
     peer.change(lambda robot, _: setattr(robot.action, "silent", True))
     loop.start()

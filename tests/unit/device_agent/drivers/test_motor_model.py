@@ -122,6 +122,14 @@ def test_a_motor_at_its_limit_without_motion_has_stalled() -> None:
         assert [name for _ in range(30) for name in health.stalled(0.1, *state)] == []
 
 
+def test_fingers_that_an_object_stops_have_not_stalled() -> None:
+    health = MotorModel(UR5.joints, None, grips=("elbow",))
+    behind = np.array([0.0, 0.0, 0.3, 0.3, 0.0, 0.0])
+    effort = np.where(behind > 0, MOST, 0.0)
+    stalled = [name for _ in range(30) for name in health.stalled(0.1, behind, effort, STILL)]
+    assert set(stalled) == {"wrist_1"}
+
+
 # ------------------------------------------------------------ the file
 
 

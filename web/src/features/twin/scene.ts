@@ -1,26 +1,30 @@
 /** The 3D view of a robot. Loaded on demand; draws only after changes. */
 import type { Targets } from "../steering/model";
 import {
-  BoxGeometry, type BufferGeometry, CapsuleGeometry, Color, CylinderGeometry, DirectionalLight, Group, GridHelper,
-  HemisphereLight, Mesh, MeshBasicMaterial, MeshStandardMaterial, type Material, Object3D, PerspectiveCamera,
-  PlaneGeometry, Scene, SphereGeometry, SRGBColorSpace, Vector3, WebGLRenderer,
+  type BufferGeometry, Color, DirectionalLight, GridHelper, HemisphereLight, type Material, type Mesh, MeshBasicMaterial, MeshLambertMaterial,
+  MeshStandardMaterial, PerspectiveCamera, Scene, SRGBColorSpace, Vector3, WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { radians } from "../../shared/lib/angles";
 import { isVisibleChange } from "./model/visible-change";
-import { add, forward, placementOf, rotate, jointPosition } from "./model/forward-kinematics";
+import { add, forward, rotate } from "./model/forward-kinematics";
+import { now } from "../../shared/lib/clock";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
 import type { Geometry } from "../../shared/mqtt/protocol.generated";
 import type { Vector3 as Vector } from "../../shared/lib/vectors";
 import { DrawSlot } from "../../shared/hooks/draw-scheduler";
+import { RobotMeshes } from "./robot-meshes";
 
 export class NoWebglError extends Error {
   override name = "NoWebglError";
 }
 
 export interface LiveScene {
-  /** Shows the measured pose, and the target's if it differs (`null`: none). */
-  show(measured: Targets, target: Targets | null): void;
+  /**
+   * Shows the measured pose, and the target's if it differs (`null`: none). `moving`: the view follows a pointer. Then it is drawn in each
+   * frame, and on a slow machine at a lower quality until it rests.
+   */
+  show(measured: Targets, target: Targets | null, moving?: boolean): void;
   /** Applies changed theme colours. */
   recolour(): void;
   resetView(): void;
@@ -31,8 +35,13 @@ export interface LiveScene {
 const GHOST_FROM = 0.005;
 const GHOST_COLOUR = 0x2f8fe0;
 const GHOST_OPACITY = 0.28;
-
-type Robot = Object3D[];
+/** A longer time between two frames of a moving view is slow; after this many, the machine has no graphics card [ms]. */
+const SLOW_MS = 28;
+const SLOW_FRAMES = 3;
+/** Resolution of a quick frame, relative to that of the screen. */
+const QUICK_RESOLUTION = 0.5;
+/** A view that has not moved for this time is drawn at full quality [ms]. */
+const REST_MS = 600;
 
 /** Builds the view inside `canvas`. `onFrame` is called after every drawn frame. Throws `NoWebglError`. */
 export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame: () => void): LiveScene {
@@ -50,7 +59,9 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
   let requested: Poses = { measured: {}, target: null };
   let drawn: Poses | null = null;
   let visible = true;
+  const quality = new Quality(renderer, robots.materials);
   const slot = new DrawSlot(() => {
+    quality.apply(canvas);
     robots.pose(requested);
     renderer.render(scene, camera);
     drawn = requested;
@@ -58,8 +69,9 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
   });
   // A view outside the viewport does not draw, except its first frame, so that scrolling never shows an empty view.
   const requestDraw = (): void => {
-    if (visible || drawn === null) slot.request();
+    if (visible || drawn === null) slot.request(quality.moving);
   };
+  quality.onRest = requestDraw;
   const resetView = (): void => {
     controls.target.copy(home.centre);
     camera.position.copy(home.centre).add(new Vector3(1.15, -1.5, 0.75).normalize().multiplyScalar(home.radius * 3.2));
@@ -69,8 +81,7 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
   const resize = (): void => {
     const { clientWidth: width, clientHeight: height } = canvas;
     if (width === 0 || height === 0) return;
-    renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
-    renderer.setSize(width, height, false);
+    quality.resize(canvas);
     camera.aspect = width / height;
     camera.updateProjectionMatrix();
     // A resize clears the canvas.
@@ -86,7 +97,9 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
   resetView();
 
   return {
-    show(measured, target) {
+    show(measured, target, moving = false) {
+      if (moving) quality.move();
+      else quality.rest();
       requested = { measured, target: target !== null && differs(measured, target) ? target : null };
       const pxPerM = canvas.height / (2 * Math.tan(radians(camera.fov) / 2)) / nearest(camera, controls.target, home.reach);
       const seen = (next: Targets | null, last: Targets | null): boolean => isVisibleChange(last, next, home.reach, pxPerM);
@@ -101,14 +114,10 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
     resetView,
     dispose() {
       slot.dispose();
+      quality.dispose();
       stopWatching();
       controls.dispose();
-      scene.traverse((object) => {
-        if (!(object instanceof Mesh)) return;
-        const mesh = object as Mesh<BufferGeometry, Material>;
-        mesh.geometry.dispose();
-        mesh.material.dispose();
-      });
+      robots.dispose();
       grid.dispose();
       renderer.dispose();
     },
@@ -130,26 +139,107 @@ interface Poses {
   target: Targets | null;
 }
 
+/** The materials of a mesh: for a full and for a quick frame. */
+interface Materials {
+  mesh: Mesh<BufferGeometry, Material>;
+  full: Material;
+  quick: Material;
+}
+
+/** How well a view is drawn: on a slow machine, a moving view has half the resolution and simple shading. */
+class Quality {
+  readonly #renderer: WebGLRenderer;
+  readonly #materials: readonly Materials[];
+  #timer: ReturnType<typeof setTimeout> | undefined;
+  #moving = false;
+  #quick = false;
+  #slowFrames = 0;
+  #drawnAt = -Infinity;
+  onRest = (): void => undefined;
+
+  constructor(renderer: WebGLRenderer, materials: readonly Materials[]) {
+    this.#renderer = renderer;
+    this.#materials = materials;
+  }
+
+  get moving(): boolean {
+    return this.#moving;
+  }
+
+  /** The view moves now. */
+  move(): void {
+    this.#moving = true;
+    clearTimeout(this.#timer);
+    this.#timer = setTimeout(() => this.rest(), REST_MS);
+  }
+
+  /** The view no longer moves. */
+  rest(): void {
+    clearTimeout(this.#timer);
+    this.#moving = false;
+    this.#drawnAt = -Infinity;
+    if (this.#quick) this.onRest();
+  }
+
+  /** Called before each frame. */
+  apply(canvas: HTMLCanvasElement): void {
+    const at = now();
+    if (this.#moving && this.#slowFrames < SLOW_FRAMES) {
+      const first = this.#drawnAt === -Infinity;
+      this.#slowFrames = first ? this.#slowFrames : at - this.#drawnAt > SLOW_MS ? this.#slowFrames + 1 : 0;
+    }
+    if (this.#moving) this.#drawnAt = at;
+    const quick = this.#moving && this.#slowFrames >= SLOW_FRAMES;
+    if (quick === this.#quick) return;
+    this.#quick = quick;
+    for (const { mesh, ...materials } of this.#materials) mesh.material = quick ? materials.quick : materials.full;
+    this.resize(canvas);
+  }
+
+  resize({ clientWidth, clientHeight }: HTMLCanvasElement): void {
+    this.#renderer.setPixelRatio(Math.min(devicePixelRatio, 2) * (this.#quick ? QUICK_RESOLUTION : 1));
+    this.#renderer.setSize(clientWidth, clientHeight, false);
+  }
+
+  dispose(): void {
+    clearTimeout(this.#timer);
+  }
+}
+
 /** The robot's measured pose and the ghost of its target. */
-function createRobots(scene: Scene, twin: KnownTwin): { pose: (shown: Poses) => void } {
-  const solid = build(scene, twin, solidMaterial);
-  const ghostRoot = new Group();
-  scene.add(ghostRoot);
-  const material = new MeshBasicMaterial({
-    color: GHOST_COLOUR,
-    transparent: true,
-    opacity: GHOST_OPACITY,
-    depthWrite: false,
+function createRobots(scene: Scene, twin: KnownTwin): { pose: (shown: Poses) => void; materials: Materials[]; dispose: () => void } {
+  const [full, quick] = [new Map<number, Material>(), new Map<number, Material>()];
+  const solid = new RobotMeshes(twin, (alpha) => shared(full, alpha, () => new MeshStandardMaterial({ ...surface(alpha), roughness: 0.55, metalness: 0.1 })), { fixed: true });
+  const material = new MeshBasicMaterial({ color: GHOST_COLOUR, transparent: true, opacity: GHOST_OPACITY, depthWrite: false });
+  const ghost = new RobotMeshes(twin, () => material, { fixed: false });
+  scene.add(solid.root, ghost.root);
+  ghost.root.visible = false;
+  const materials = solid.meshes.map((mesh): Materials => {
+    const { opacity } = mesh.material;
+    return { mesh, full: mesh.material, quick: shared(quick, opacity, () => new MeshLambertMaterial(surface(opacity))) };
   });
-  const ghost = build(ghostRoot, twin, () => material, moving(twin));
-  ghostRoot.visible = false;
   return {
+    materials,
     pose({ measured, target }) {
-      pose(solid, twin, measured);
-      ghostRoot.visible = target !== null;
-      if (target !== null) pose(ghost, twin, target);
+      solid.pose(measured);
+      ghost.root.visible = target !== null;
+      if (target !== null) ghost.pose(target);
+    },
+    dispose() {
+      for (const { geometry } of [...solid.meshes, ...ghost.meshes]) geometry.dispose();
+      for (const each of [material, ...full.values(), ...quick.values()]) each.dispose();
     },
   };
+}
+
+function surface(opacity: number): { vertexColors: true; transparent: boolean; opacity: number } {
+  return { vertexColors: true, transparent: opacity < 1, opacity };
+}
+
+function shared(known: Map<number, Material>, alpha: number, create: () => Material): Material {
+  const found = known.get(alpha) ?? create();
+  known.set(alpha, found);
+  return found;
 }
 
 function differs(measured: Targets, target: Targets): boolean {
@@ -171,70 +261,6 @@ function observeCanvas(canvas: HTMLCanvasElement, onResize: () => void, onVisibl
     sizes.disconnect();
     places.disconnect();
   };
-}
-
-function solidMaterial(geometry: Geometry): Material {
-  const [red, green, blue, alpha] = geometry.rgba;
-  return new MeshStandardMaterial({
-    color: new Color().setRGB(red, green, blue, SRGBColorSpace),
-    roughness: 0.55,
-    metalness: 0.1,
-    transparent: alpha < 1,
-    opacity: alpha,
-  });
-}
-
-/** One object for each body, in the twin's order, nested in its parent. */
-function build(
-  root: Object3D,
-  twin: KnownTwin,
-  material: (geometry: Geometry) => Material,
-  only?: ReadonlySet<number>,
-): Robot {
-  const bodies: Robot = [];
-  for (const [index, body] of twin.bodies.entries()) {
-    const object = new Group();
-    for (const geometry of only?.has(index) === false ? [] : body.geometries) {
-      if (geometry.shape === "plane") continue; // The grid is the floor.
-      const mesh = new Mesh(shape(geometry), material(geometry));
-      mesh.position.set(...geometry.position_m);
-      const [w, x, y, z] = geometry.quaternion;
-      mesh.quaternion.set(x, y, z, w).normalize();
-      if (geometry.shape === "ellipsoid") mesh.scale.set(...geometry.size_m);
-      object.add(mesh);
-    }
-    (bodies[body.parent] ?? root).add(object);
-    bodies.push(object);
-  }
-  pose(bodies, twin, {});
-  return bodies;
-}
-
-/** MuJoCo uses half sizes, and its capsules and cylinders lie along z; those of three.js along y. */
-function shape({ shape: kind, size_m: [a, b, c] }: Geometry): BufferGeometry {
-  switch (kind) {
-    case "box":
-      return new BoxGeometry(2 * a, 2 * b, 2 * c);
-    case "sphere":
-      return new SphereGeometry(a, 32, 20);
-    case "ellipsoid":
-      return new SphereGeometry(1, 32, 20);
-    case "capsule":
-      return new CapsuleGeometry(a, 2 * b, 10, 28).rotateX(Math.PI / 2);
-    case "cylinder":
-      return new CylinderGeometry(a, a, 2 * b, 36).rotateX(Math.PI / 2);
-    case "plane":
-      return new PlaneGeometry(2 * a, 2 * b);
-  }
-}
-
-function pose(robot: Robot, twin: KnownTwin, positions: Targets): void {
-  twin.bodies.forEach((body, index) => {
-    const { position_m, quaternion } = placementOf(body, jointPosition(body.joint, positions));
-    const [w, x, y, z] = quaternion;
-    robot[index]?.position.set(...position_m);
-    robot[index]?.quaternion.set(x, y, z, w);
-  });
 }
 
 /** Indices of the bodies that move. */
