@@ -58,15 +58,16 @@ class Bridge:
                 case topics.TELE if device in self._known:
                     self._measured(device, parsed.name, payload)
                 case topics.CAM if device in self._known:
-                    self._publish(
-                        discovery.topic(device, "cam", parsed.name), camera_frames.decode(payload).jpeg, False
-                    )
+                    frame = camera_frames.decode(payload)
+                    if frame.kind == camera_frames.COLOUR:
+                        self._publish(discovery.topic(device, "cam", parsed.name), frame.content, False)
         except ProtocolError as error:
             _log.warning("%s: %s", topic, str(error)[:300])
 
     def _describe(self, device: str, description: Description) -> None:
-        if description.joints or not (description.streams or description.controls or description.cameras):
-            return  # robots are not controlled from Home Assistant
+        shown = description.streams or description.controls or discovery.pictures(description)
+        if description.joints or not shown:
+            return  # robots are not controlled from Home Assistant, which shows no depth images and people
         self._known[device] = description
         self._announce(discovery.announce_device(device, description))
         self._publish(discovery.topic(device, "available"), b"online", True)

@@ -7,7 +7,7 @@ Fields follow https://www.home-assistant.io/integrations/mqtt/. Measurements are
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from device_agent.protocol import Control, Description
+from device_agent.protocol import CameraStream, Control, Description, camera_frames
 
 DISCOVERY = "homeassistant"
 """Home Assistant's default discovery prefix."""
@@ -78,11 +78,16 @@ def announce_values(
         yield _announce("sensor", device, f"{stream}-{field}", content)
 
 
+def pictures(description: Description) -> tuple[CameraStream, ...]:
+    """The streams of frames that Home Assistant can show."""
+    return tuple(camera for camera in description.cameras if camera.kind == camera_frames.COLOUR)
+
+
 def announce_device(device: str, description: Description) -> Iterator[Announcement]:
     """Configurations of a device's controls and cameras."""
     for control in description.controls:
         yield _announce("number", device, f"set-{control.name}", _number(device, description, control))
-    for camera in description.cameras:
+    for camera in pictures(description):
         content = _common(device, description, f"cam-{camera.name}", camera.name)
         content["topic"] = topic(device, "cam", camera.name)
         yield _announce("camera", device, f"cam-{camera.name}", content)

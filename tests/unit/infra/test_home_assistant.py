@@ -122,6 +122,14 @@ def test_measurements_and_frames_are_forwarded_unchanged(bridge: RecordingBridge
     ]
 
 
+def test_frames_that_are_no_pictures_are_neither_announced_nor_forwarded(bridge: RecordingBridge) -> None:
+    assert not [topic for topic, _ in bridge.announced() if "/a-depth/" in topic or "cam-scan" in topic]
+    published = list(bridge.published)
+    for device, kind in (("depth", "depth"), ("depth", "people"), ("lidar", "scan")):
+        bridge.receive(device, topics.CAM, camera_frames.encode(CameraFrame(1, 1, 4, 3, b"{}", kind)), kind)
+    assert bridge.published == published
+
+
 def test_robots_and_invalid_messages_are_ignored(bridge: RecordingBridge) -> None:
     published = list(bridge.published)
     bridge.receive("arm", topics.TELE, measurements({"x": 1.0}), "joints")
@@ -134,7 +142,8 @@ def test_robots_and_invalid_messages_are_ignored(bridge: RecordingBridge) -> Non
 def test_an_offline_agent_makes_its_devices_unavailable(bridge: RecordingBridge) -> None:
     bridge.disconnect("a")
     bridge.disconnect("other")
-    expected = [device.name for device in LAB.devices if device.streams or device.controls or device.cameras]
+    pictures = {device.name for device in LAB.devices for camera in device.cameras if camera.kind == "colour"}
+    expected = [device.name for device in LAB.devices if device.streams or device.controls or device.name in pictures]
     assert sorted(bridge.offline()) == sorted(f"telescope/a-{name}/available" for name in expected)
 
 
