@@ -1,0 +1,10 @@
+export { type EpisodeList, changed, episodeAt, removed, rated, SHORTEST_S, split, trimmed } from "./episodes";
+export { comparedColumns, type PlotColumns, plotColumns } from "./plot-columns";
+export { type Moment, type Range, Replay, type Sources, SPEEDS } from "./replay";
+export { appliedBetween, replayScript } from "./replay-script";
+export { MODES, rowOf, type Samples, SOURCES, type Source } from "./samples";
+export type { Images, Segment } from "./segment";
+export { SegmentLoader } from "./segment-loader";
+export type { TimelineEvent } from "./overview";
+export { expectsMore, type Gap, type GapCause, type Timeline } from "./timeline";
+export { type EventGroup, type EventList, groupOf, nearestEvents } from "./timeline-events";
