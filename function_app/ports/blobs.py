@@ -4,9 +4,10 @@ Names are non-empty Unicode text of at most 512 characters. ``/`` only groups na
 their store does not accept.
 """
 
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
+from urllib.parse import urlsplit
 
 MAX_NAME_LENGTH = 512
 MAX_BYTES = 64 * 1024 * 1024
@@ -39,6 +40,10 @@ class Blobs(Protocol):
         await blobs.put("drawings/ur5", content)
         assert await blobs.get("drawings/ur5") == content
     """
+
+    @property
+    def origin(self) -> str:
+        """Origin of all presigned URLs, such as ``https://store.example``; empty if the functions serve them."""
 
     async def put(self, name: str, content: bytes) -> None:
         """Write a blob and replace earlier content."""
@@ -87,7 +92,7 @@ class TransferRefused(Exception):  # noqa: N818 (the caller answers the request 
 class Download:
     """The content of a presigned download."""
 
-    content: AsyncIterator[bytes]
+    content: AsyncGenerator[bytes, None]
     length: int
     content_type: str
 
@@ -110,6 +115,12 @@ class Transfers(Protocol):
             TransferRefused: The token is not ours or expired, or the blob does not exist.
             StoreError: The store is not available.
         """
+
+
+def origin_of(url: str) -> str:
+    """The origin of a URL; empty if it has no host."""
+    parts = urlsplit(url)
+    return f"{parts.scheme}://{parts.netloc}" if parts.netloc else ""
 
 
 def check_upload(length: int) -> None:

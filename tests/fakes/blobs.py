@@ -3,7 +3,7 @@
 import asyncio
 import secrets
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from typing import NamedTuple
 from urllib.parse import quote
 
@@ -28,6 +28,10 @@ class MemoryBlobs:
         self._addresses: dict[str, _Address] = {} if shared is None else shared._addresses
         self.url = url
         self._now_s = now_s
+
+    @property
+    def origin(self) -> str:
+        return ""
 
     async def put(self, name: str, content: bytes) -> None:
         check_name(name)
@@ -102,5 +106,5 @@ class MemoryBlobs:
         return address
 
 
-async def _parts(content: bytes) -> AsyncIterator[bytes]:
+async def _parts(content: bytes) -> AsyncGenerator[bytes, None]:
     yield content

@@ -1,6 +1,6 @@
-"""Write-ahead journal of an agent: commands, epochs, Stop latches, movement versions and the session number.
+"""Write-ahead journal of an agent: commands, epochs, Stop latches, movement versions, consents and the session number.
 
-One SQLite file per agent. Epochs, latches, movement versions and terminal acks are on disk when their call returns.
+One SQLite file per agent. Epochs, latches, versions, consents and terminal acks are on disk when their call returns.
 Other acks survive a crash of the agent, but not a power failure. Before a command moves a device, ``sync`` writes them
 to disk.
 """
@@ -29,6 +29,7 @@ CREATE TABLE IF NOT EXISTS devices (
 CREATE TABLE IF NOT EXISTS movements (
     device TEXT NOT NULL, author TEXT NOT NULL, robot_type TEXT NOT NULL, name TEXT NOT NULL, version INTEGER NOT NULL,
     PRIMARY KEY (device, author, robot_type, name)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS camera_consents (device TEXT PRIMARY KEY, number INTEGER NOT NULL, consent BLOB NOT NULL);
 CREATE TABLE IF NOT EXISTS counters (name TEXT PRIMARY KEY, value INTEGER NOT NULL);
 """
 _CACHE_KB = 256
@@ -252,6 +253,21 @@ class Journal:
                 "INSERT INTO movements VALUES (?, ?, ?, ?, ?) ON CONFLICT (device, author, robot_type, name) "
                 "DO UPDATE SET version = max(version, excluded.version)",
                 (device, author, robot_type, name, version),
+            )
+
+    def camera_consent(self, device: str) -> tuple[int, bytes]:
+        """Number and content of the newest consent to record a device's cameras; 0 and nothing if there is none."""
+        with self._lock:
+            rows = self._execute("SELECT number, consent FROM camera_consents WHERE device = ?", (device,))
+        return rows[0] if rows else (0, b"")
+
+    def save_camera_consent(self, device: str, number: int, consent: bytes) -> None:
+        """Record a consent; an older one changes nothing."""
+        with self._lock, self._on_disk():
+            self._execute(
+                "INSERT INTO camera_consents VALUES (?, ?, ?) ON CONFLICT (device) DO UPDATE SET "
+                "number = excluded.number, consent = excluded.consent WHERE excluded.number > number",
+                (device, number, consent),
             )
 
     def next_session(self) -> int:

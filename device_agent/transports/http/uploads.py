@@ -1,8 +1,10 @@
 """Uploads over HTTP: requests an upload URL, sends the content there, and registers it."""
 
 import hashlib
+import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 from urllib.parse import urljoin
 
 import requests
@@ -10,6 +12,10 @@ import requests
 from device_agent.ports.uploads import UploadError
 from device_agent.transports.http.client import CloudClient, CloudError
 
+# URLs of uploads are a right to write: a token in the path, or a signature in the query.
+logging.getLogger("urllib3.connectionpool").addFilter(
+    lambda record: "/blobs/" not in record.getMessage() and "?" not in record.getMessage()
+)
 _WITHIN_S = 60.0
 
 
@@ -39,10 +45,7 @@ class HttpUploads:
                 api = self._api = self._api or self._open_api()
                 created = api.post(path, metadata)
                 upload = str(created["id"])
-                url = urljoin(api.server, str(created["url"]))
-                # The pinned authority applies to the server only, not to a blob store.
-                verify = str(api.ca) if api.ca is not None and url.startswith(api.server) else True
-                _send(str(created["method"]), url, dict(created["headers"]), content, verify)
+                send(api, created, content)
                 api.post(f"{path}/{upload}/complete", {"device": device})
             except (CloudError, OSError) as error:
                 raise UploadError(f"the capture could not be stored: {error}") from error
@@ -51,14 +54,28 @@ class HttpUploads:
         return upload
 
 
-def _send(method: str, url: str, headers: dict[str, str], content: bytes, verify: str | bool) -> None:
-    """Send the content to the upload URL, without the agent's token and without ``.netrc`` credentials."""
+def send(api: CloudClient, request: Mapping[str, Any], content: bytes | Iterable[bytes]) -> None:
+    """Send the content to an upload URL, without the agent's token and without ``.netrc`` credentials.
+
+    Args:
+        api: Client of the cloud that returned the request.
+        request: ``method``, ``url`` and ``headers``.
+        content: The content, or an object with ``__len__`` and ``read`` that limits the rate.
+
+    Raises:
+        UploadError: The blob store rejects the content.
+        OSError: It cannot be reached.
+        KeyError: The request is incomplete, and so are other errors of its conversion.
+    """
+    url = urljoin(api.server, str(request["url"]))
+    # The pinned authority applies to the server only, not to a blob store.
+    verify = str(api.ca) if api.ca is not None and url.startswith(api.server) else True
     try:
         response = requests.request(
-            method,
+            str(request["method"]),
             url,
             data=content,
-            headers=headers,
+            headers=dict(request["headers"]),
             auth=_no_auth,
             timeout=_WITHIN_S,
             allow_redirects=False,

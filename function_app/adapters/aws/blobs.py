@@ -12,12 +12,21 @@ from typing import Any
 from function_app.adapters.aws import names
 from function_app.adapters.aws.client import Client, ServiceError
 from function_app.adapters.shared.appending import Appends
-from function_app.ports.blobs import Upload, check_name, check_size, check_upload
+from function_app.ports.blobs import Upload, check_name, check_size, check_upload, origin_of
 
 _PAGE = 1_000
 """Maximum number of keys in a response of S3."""
 _DEFAULT_REGION = "us-east-1"
 """S3 rejects this region as a location constraint."""
+_DOMAINS = {
+    "cn-": "amazonaws.com.cn",
+    "eusc-": "amazonaws.eu",
+    "us-iso-": "c2s.ic.gov",
+    "us-isob-": "sc2s.sgov.gov",
+    "us-isof-": "csp.hci.ic.gov",
+    "eu-isoe-": "cloud.adc-e.uk",
+}
+"""Beginnings of regions with a domain of their own, as in the SDK's list of partitions."""
 _TAIL = "tail"
 _NOT_FOUND = frozenset({"404", "NoSuchKey"})
 _CONCURRENT_WRITE = frozenset({"ConditionalRequestConflict", "PreconditionFailed", "NoSuchKey"})
@@ -32,6 +41,7 @@ class S3Blobs:
         """``endpoint`` is an emulator's address. The SDK reads credentials from the role or the environment."""
         self._bucket = bucket
         self._region = region
+        self._endpoint = endpoint
         self._client = Client(
             "s3",
             resource=f"the S3 bucket '{bucket}'",
@@ -42,8 +52,20 @@ class S3Blobs:
         )
         self._appends = Appends()
 
-    async def prepare(self) -> None:
+    @property
+    def origin(self) -> str:
+        """That of the endpoint, or of the bucket's host; a bucket with dots has no host of its own."""
+        if self._endpoint is not None:
+            return origin_of(self._endpoint)
+        region = "" if self._region == _DEFAULT_REGION else f".{self._region}"
+        bucket = "" if "." in self._bucket else f"{self._bucket}."
+        domain = next((name for start, name in _DOMAINS.items() if self._region.startswith(start)), "amazonaws.com")
+        return f"https://{bucket}s3{region}.{domain}"
+
+    async def prepare(self, *, console: str = "") -> None:
         """Create the bucket if it does not exist. Idempotent; allows concurrent calls.
+
+        The console, a page at the origin ``console``, may download from a bucket without other rules for pages (CORS).
 
         Raises:
             StoreError: It cannot be created; another account may own the name.
@@ -56,6 +78,9 @@ class S3Blobs:
         except ServiceError as error:
             if error.code != "BucketAlreadyOwnedByYou":
                 raise
+        if console and not await self._has_cors_rules():
+            rule = {"AllowedOrigins": [console], "AllowedMethods": ["GET"]}
+            await self._client.call("put_bucket_cors", Bucket=self._bucket, CORSConfiguration={"CORSRules": [rule]})
 
     async def put(self, name: str, content: bytes) -> None:
         check_size(len(content))
@@ -125,6 +150,15 @@ class S3Blobs:
 
     async def close(self) -> None:
         await self._client.close()
+
+    async def _has_cors_rules(self) -> bool:
+        try:
+            await self._client.call("get_bucket_cors", Bucket=self._bucket)
+        except ServiceError as error:
+            if error.code == "NoSuchCORSConfiguration":
+                return False
+            raise
+        return True
 
     async def _name(self, key: str) -> str | None:
         """The name of an object; ``None`` if it was deleted in the meantime."""

@@ -18,7 +18,7 @@ from function_app.adapters.azure import names
 from function_app.adapters.azure.client import ATTEMPTS, Client, Endpoint, ServiceError, code_of, credential, transport
 from function_app.adapters.azure.sas_keys import SasKeys
 from function_app.adapters.shared.appending import TRIES, Appends, pause
-from function_app.ports.blobs import MAX_BYTES, Upload, check_name, check_size, check_upload
+from function_app.ports.blobs import MAX_BYTES, Upload, check_name, check_size, check_upload, origin_of
 from function_app.ports.tables import StoreError
 
 if TYPE_CHECKING:
@@ -55,8 +55,20 @@ class AzureBlobs:
             resource=f"the Azure container '{container}'",
             role="Storage Blob Data Contributor",
         )
+        self._endpoint = endpoint
         self._appends = Appends()
         self._keys = SasKeys(endpoint)
+
+    @property
+    def origin(self) -> str:
+        """That of the blob service; empty if the connection string names none."""
+        fields = dict(part.split("=", 1) for part in self._endpoint.connection.split(";") if "=" in part)
+        given = {name.strip().lower(): value.strip() for name, value in fields.items()}
+        url = self._endpoint.url or given.get("blobendpoint", "")
+        if not url and "accountname" in given:
+            scheme = given.get("defaultendpointsprotocol", "https")
+            url = f"{scheme}://{given['accountname']}.blob.{given.get('endpointsuffix', 'core.windows.net')}"
+        return origin_of(url)
 
     async def put(self, name: str, content: bytes) -> None:
         check_size(len(content))

@@ -6,7 +6,7 @@ import contextlib
 import os
 import secrets
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote, unquote
@@ -58,6 +58,11 @@ class FileBlobs:
         random_keys = (secrets.token_bytes(32),)
         self._keys = keys or (lambda: random_keys)
         self._url = url
+
+    @property
+    def origin(self) -> str:
+        """None of its own: the functions serve the URLs."""
+        return ""
 
     async def put(self, name: str, content: bytes) -> None:
         check_size(len(content))
@@ -238,7 +243,7 @@ class FileBlobs:
         return tuple(sorted(names)[:limit])
 
 
-async def _parts(file: BinaryIO) -> AsyncIterator[bytes]:
+async def _parts(file: BinaryIO) -> AsyncGenerator[bytes, None]:
     # Closed without waiting: in a cancelled request each wait is cancelled, too.
     with file:
         while part := await asyncio.to_thread(file.read, _READ_BYTES):

@@ -25,6 +25,7 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.robot_types.movements import Movement
+from function_app.domain.telemetry.recordings import RecordingRow, Segment
 from function_app.ports.tables import StoreError
 from function_app.services.robot_types.script_store import blob_name
 from function_app.services.storage import records
@@ -101,12 +102,16 @@ def _restore(configuration: Settings, options: argparse.Namespace) -> int:
             for problem in (*table_file.damage(new / archive.TABLES), *_missing_keys(new)):
                 raise ArchiveError(f"{options.file}: {problem}")
             kept_keys = _keep_newer_keys(home, new)
-            count = asyncio.run(_settle(replace(configuration, home=new), manifest.created_ms))
+            count, problems = asyncio.run(_settle(replace(configuration, home=new), manifest.created_ms))
             private_folder.restrict(new, advice="restore it again")
             former = archive.swap(new, home)
         finally:
             shutil.rmtree(new, ignore_errors=True)
     print(f"restored {home} from a backup of {rfc3339(manifest.created_ms)}; {count} actions were in progress")
+    for problem in problems:
+        print(f"PROBLEM {problem}")
+    if problems:
+        print(f"{len(problems)} problems found in the backup")
     if former is not None:
         print(f"the former data are in {former}; delete them when the server works")
     if kept_keys:
@@ -119,10 +124,12 @@ def _restore(configuration: Settings, options: argparse.Namespace) -> int:
     return 0
 
 
-async def _settle(configuration: Settings, created_ms: int) -> int:
+async def _settle(configuration: Settings, created_ms: int) -> tuple[int, list[str]]:
+    """Settle what was in progress; returns the number of open actions, and problems with blobs."""
     async with _functions(configuration) as functions:
         agents = table_file.partitions(configuration.home / archive.TABLES, records.AGENTS)
-        return await functions.restored_backup.settle(created_ms=created_ms, agents=agents)
+        count = await functions.restored_backup.settle(created_ms=created_ms, agents=agents)
+        return count, await _complete(_blob_problems, functions)
 
 
 def _verify(configuration: Settings, options: argparse.Namespace) -> int:
@@ -208,7 +215,7 @@ async def _audit_problems(functions: Functions) -> list[str]:
 
 
 async def _blob_problems(functions: Functions) -> list[str]:
-    """Scripts and captures whose blob is missing or has another content."""
+    """Scripts, captures and recordings whose blob is missing or has another content."""
     tables = functions.settings.home / archive.TABLES
     problems = set()
     for partition in table_file.partitions(tables, records.MOVEMENTS):
@@ -229,4 +236,28 @@ async def _blob_problems(functions: Functions) -> list[str]:
             )
             if await functions.blobs.size(row.data["blob"]) != row.data["length"]
         }
+    for partition in table_file.partitions(tables, records.RECORDINGS):
+        problems |= await _recording_problems(functions, partition)
     return sorted(problems)
+
+
+async def _recording_problems(functions: Functions, partition: str) -> set[str]:
+    """Stored segments of one device whose files are missing or have another content."""
+    # Rows are sorted by key: those of recordings precede those of segments.
+    device = partition.partition("/")[0]
+    problems: set[str] = set()
+    deleted: set[int] = set()
+    async for row in records.all_rows(functions.tables, records.RECORDINGS, partition):
+        if not row.key.startswith("segment:"):
+            recording = records.read(row, RecordingRow)
+            deleted |= {recording.epoch} if recording.deleted else set()
+            continue
+        segment = records.read(row, Segment)
+        if segment.state != "stored" or segment.epoch in deleted or segment.expires_ms <= functions.clock.now_ms():
+            continue
+        for name, sha256 in ((segment.blob, segment.sha256), (segment.overview_blob, segment.overview_sha256)):
+            content = await functions.blobs.get(name)
+            if content is None or hashlib.sha256(content).hexdigest() != sha256:
+                place = f"segment {segment.segment} of the recording of session {segment.epoch} of {device}"
+                problems.add(f"{place} ({name}) is missing or damaged")
+    return problems

@@ -17,7 +17,7 @@ from function_app.services.storage import records
 DAY_MS = 86_400_000
 MB = 1_000_000
 _PAGE = 1_000
-_ACCOUNT_PREFIXES = ("movements", "robot-types")
+_ACCOUNT_PREFIXES = ("movements", "robot-types", "recordings")
 """Blob names that continue with the account."""
 
 _log = logging.getLogger(__name__)

@@ -34,8 +34,8 @@ well, ``invitation:<id>``."""
 INVITATIONS = "Invitations"
 """Partition: first letter of the secret's hash; key: the hash, which is the invitation's id."""
 CONTROL = "Control"
-"""Partition: device id; keys ``now:lease``, ``now:slot``, ``now:queue``, ``action:<suffix>``, ``once:<hash>``, and
-``event:<id>`` for events to publish."""
+"""Partition: device id; keys ``now:lease``, ``now:slot``, ``now:queue``, ``action:<suffix>``, ``once:<hash>``,
+``camera-consent``, and ``event:<id>`` for events to publish."""
 PENDING = "Pending"
 """Partition: shard; key: ``<due ms>:<what>``, an action's id, ``queue:<device id>``, ``lease:<device id>``,
 ``leave:<agent id>``, ``share-changed:<on>|<account id>``, ``share-expires:<on>|<account id>``
@@ -67,8 +67,15 @@ UPLOADS = "Uploads"
 """Partition: ``<device>/<pairing>``; see ``services/telemetry/uploads.py``."""
 USAGE = "Usage"
 """Partition: account id; key: blob name. Size of each stored blob; see ``services/storage/quota.py``."""
+RECORDINGS = "Recordings"
+"""Partition: ``<device>/<pairing>``; keys ``recording:<epoch>``, ``segment:<epoch>:<number>``."""
 EVENTS = "Events"
 """Partition: ``<device>/<pairing>``; key: counts down with time, newest first."""
+SESSIONS = "Sessions"
+"""Partition: ``<device>/<pairing>``; key: counts down with the epoch, newest first."""
+TRIALS = "Trials"
+"""Partition: ``<device>/<pairing>``, key: last part of the action's id, newest first; and
+``batches/<account>/<robot type>``, key ``<task>:<counts down with time>``."""
 AUDIT = "Audit"
 """Partition: account id (or ``cloud``); keys ``head``, ``record:<number>``, ``wait:<id>``, ``once:<day>:<id>``; and
 ``chains``, which lists them. See ``services/audit/audit_log.py``."""

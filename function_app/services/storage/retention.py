@@ -1,13 +1,14 @@
 """Scheduled deletion of rows and blobs.
 
 A deletion is scheduled together with the data and removed last, so it survives a killed process. Rows with a later
-``expires_ms`` are kept; their writer has scheduled another deletion.
+``expires_ms`` are kept, because their writer has scheduled another deletion, unless a whole partition is deleted.
 """
 
 import asyncio
 import hashlib
 import json
 import logging
+from collections.abc import Sequence
 from typing import Any, Final
 
 from function_app.ports.blobs import Blobs
@@ -40,13 +41,17 @@ class Retention:
         """
         await self._note({"table": table, "partition": partition, "first": first, "last": last}, due_ms)
 
+    async def delete_partition_at(self, table: str, partition: str, *, due_ms: int) -> None:
+        """Delete all rows of a partition, also those with a later ``expires_ms``. Idempotent."""
+        await self._note({"table": table, "partition": partition, "first": "", "last": None, "all": True}, due_ms)
+
     async def delete_row_at(self, table: str, partition: str, key: str, *, due_ms: int) -> None:
         """Delete one row, like ``delete_rows_at``."""
         await self.delete_rows_at(table, partition, first=key, last=key + "\0", due_ms=due_ms)
 
-    async def delete_blob_at(self, name: str, *, due_ms: int) -> None:
-        """Delete a blob at ``due_ms``. Idempotent."""
-        await self._note({"blob": name}, due_ms)
+    async def delete_blob_at(self, name: str, *, due_ms: int, row: tuple[str, str, str] | None = None) -> None:
+        """Delete a blob at ``due_ms``, unless the row at ``row`` names it and expires later. Idempotent."""
+        await self._note({"blob": name} if row is None else {"blob": name, "row": row}, due_ms)
 
     async def delete_due(self, now_ms: int) -> None:
         """Execute a part of the due deletions. Idempotent and safe to run concurrently.
@@ -77,6 +82,8 @@ class Retention:
         """Delete the target of ``note``; return whether it was deleted completely."""
         target = note.data
         if "blob" in target:
+            if "row" in target and await self._is_named(target["blob"], target["row"], now_ms):
+                return True
             await self._blobs.delete(target["blob"])
             await quota.release_owned(self._tables, target["blob"])
             return True
@@ -86,13 +93,19 @@ class Retention:
             page = await self._tables.query(table, partition, first=first, last=last, limit=MAX_BATCH)
             if not page.rows:
                 return True
-            for batch in _batches([row for row in page.rows if row.data.get("expires_ms", 0) <= now_ms]):
+            expired = [row for row in page.rows if "all" in target or row.data.get("expires_ms", 0) <= now_ms]
+            for batch in _batches(expired):
                 await self._tables.batch(table, batch)
             if page.cursor is None:
                 return True
             first, seen = page.rows[-1].key + "\0", seen + len(page.rows)
         await self._tables.replace(records.FORGET, note.changed({"first": first}))
         return False
+
+    async def _is_named(self, blob: str, place: Sequence[str], now_ms: int) -> bool:
+        """Whether a row that has not expired names the blob; its writer has scheduled another deletion."""
+        row = await self._tables.get(*place)
+        return row is not None and row.data.get("expires_ms", 0) > now_ms and blob in row.data.values()
 
 
 def _batches(rows: list[Row]) -> list[list[Write]]:

@@ -237,8 +237,10 @@ class Uploads:
                         await self._blobs.delete(row.data["blob"])
                         await self._tables.delete(records.UPLOADS, row)
                     remains = remains or (row is not None and row.data["expires_ms"] > now_ms)
-                if not remains and deletion.data.get("account"):
-                    await quota.release(self._tables, deletion.data["account"], _blob(partition, id_))
+                if not remains:
+                    await self._blobs.delete(_blob(partition, id_))  # an upload may have ended after the deletion
+                    if deletion.data.get("account"):
+                        await quota.release(self._tables, deletion.data["account"], _blob(partition, id_))
                 await self._tables.delete(records.UPLOADS, deletion)
             except Conflict:
                 _log.debug("another process deletes %s", deletion.key)

@@ -34,12 +34,14 @@ class Direct:
     Attributes:
         renamed: Replaces a word of the name in a URL.
         binds_length: Whether the store rejects another length.
+        served: Whether the functions serve the URLs.
     """
 
     blobs: Blobs
     http: httpx.AsyncClient
     renamed: Callable[[str, str, str], str] = str.replace
     binds_length: bool = True
+    served: bool = False
 
     async def offer(self, name: str, *, length: int = 3, lifetime_s: int = 60) -> Upload:
         return await self.blobs.presign_upload(name, length=length, content_type=PNG, lifetime_s=lifetime_s)
@@ -178,6 +180,22 @@ class BlobsSuite:
         assert (download.status_code, download.content) == (200, content)
         assert download.headers["content-disposition"] == "attachment"
         assert download.headers["content-type"] == PNG
+
+    async def test_presigned_urls_have_the_origin_of_the_store(self, direct: Direct) -> None:
+        upload = await direct.offer(UPLOADED)
+        download = await direct.blobs.presign_download(UPLOADED, content_type=PNG, lifetime_s=60)
+        for url in (upload.url, download):
+            assert direct.blobs.origin == ("" if direct.served else port.origin_of(url))
+
+    @pytest.mark.parametrize(("first", "last"), [(0, 0), (5, 99), (1_048_570, 1_048_585), (2_099_990, 2_500_000)])
+    async def test_a_part_of_a_blob_is_downloaded(self, direct: Direct, first: int, last: int) -> None:
+        content = bytes(range(250)) * 8_400
+        await direct.blobs.put("a", content)
+        url = await direct.blobs.presign_download("a", content_type=PNG, lifetime_s=60)
+        response = await direct.http.get(url, headers={"Range": f"bytes={first}-{last}"})
+        assert (response.status_code, response.content) == (206, content[first : last + 1])
+        end = min(last, len(content) - 1)
+        assert response.headers["content-range"] == f"bytes {first}-{end}/{len(content)}"
 
     async def test_an_upload_never_replaces_a_blob(self, direct: Direct) -> None:
         upload = await direct.offer(UPLOADED)

@@ -10,6 +10,7 @@ from urllib.parse import unquote
 
 import httpx
 import pytest
+from botocore.session import Session
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -220,6 +221,15 @@ async def test_prepare_and_close_are_idempotent(blobs: Blobs, open_at: Open, mot
     for _ in range(2):
         await blobs.close()
     assert await blobs.get("a") == b"1"
+
+
+@pytest.mark.usefixtures("blobs")
+async def test_prepare_permits_the_console_to_read_and_keeps_other_rules(open_at: Open, moto: str) -> None:
+    client = Session().create_client("s3", region_name=REGION, endpoint_url=moto)
+    for origin in ("https://console.example", "https://other.example"):
+        await open_at(moto).prepare(console=origin)
+        rules = client.get_bucket_cors(Bucket=NAME)["CORSRules"]
+        assert rules == [{"AllowedOrigins": ["https://console.example"], "AllowedMethods": ["GET"]}]
 
 
 async def test_a_bucket_can_be_created_in_us_east_1(moto: str, closing: Closing) -> None:

@@ -38,7 +38,7 @@ async def direct(blobs: FileBlobs, tmp_path: Path) -> AsyncIterator[Direct]:
     server = uvicorn.Server(uvicorn.Config(transfer_app(blobs), log_level="warning", lifespan="off"))
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     async with httpx.AsyncClient() as client:
-        yield Direct(blobs, client, _renamed)
+        yield Direct(blobs, client, _renamed, served=True)
     server.should_exit = True
     await serving
     assert list(tmp_path.rglob("*.part")) == []

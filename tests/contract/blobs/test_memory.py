@@ -26,4 +26,4 @@ class TestMemoryBlobs(BlobsSuite):
     async def direct(self, blobs: MemoryBlobs) -> AsyncIterator[Direct]:
         transport = httpx.ASGITransport(transfer_app(blobs))
         async with httpx.AsyncClient(transport=transport, base_url=HOST) as client:
-            yield Direct(blobs, client)
+            yield Direct(blobs, client, served=True)

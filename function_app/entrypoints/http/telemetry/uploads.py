@@ -9,9 +9,9 @@ from function_app.domain.common.problems import not_found
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.devices.devices import Agent, Device
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
-from function_app.entrypoints.http.framework.responses import empty, json_response, read
+from function_app.entrypoints.http.framework.responses import empty, json_response, read, require_empty
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
-from function_app.entrypoints.http.framework.schemas import R, response_from
+from function_app.entrypoints.http.framework.schemas import EmptyRequest, R, response_from
 from function_app.entrypoints.http.telemetry import schemas
 from function_app.services.devices.device_access import devices_of, require_operator, require_owner
 from function_app.services.telemetry.uploads import LIFETIME_S, Announced, Capture
@@ -43,10 +43,17 @@ def _for_accounts(routes: Routes, functions: Functions, auth: RequestAuthenticat
         payload: schemas.UploadRequest = await read(request, schemas.UploadRequest)
         return await _begin(functions, target, payload, f"account:{operator}")
 
-    @routes.add("POST /devices/{device}/uploads/{upload}/complete", "Complete an upload", schemas.UploadOut, (404, 409))
+    @routes.add(
+        "POST /devices/{device}/uploads/{upload}/complete",
+        "Complete an upload",
+        schemas.UploadOut,
+        (404, 409),
+        optional_body=EmptyRequest,
+    )
     async def complete_upload(request: Request, device: str, upload: str) -> Response:
         """Verifies length and hash of the content. Safe to repeat."""
         target, _ = await operated_device(request, device)
+        await require_empty(request)
         return json_response(_capture_out(await functions.uploads.complete(target, upload)))
 
     @routes.add("GET /devices/{device}/uploads", "List captures of a device", schemas.UploadList, (404, 422))

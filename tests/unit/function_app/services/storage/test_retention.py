@@ -49,6 +49,16 @@ def keys(cloud: Cloud, robot: Robot, kind: str) -> list[str]:
 
 
 class TestRows:
+    def test_a_partition_is_deleted_with_rows_that_expire_later(self, alone: Cloud) -> None:
+        put(alone, "a", expires_ms=NOW_MS + DAY_MS)
+        put(alone, "b")
+        delete_later(alone)
+        run(alone)
+        assert left(alone) == ["a"]
+        alone.run(alone.functions.retention.delete_partition_at("Things", "p", due_ms=NOW_MS))
+        run(alone)
+        assert left(alone) == []
+
     def test_a_range_is_deleted_when_due(self, alone: Cloud) -> None:
         put(alone, "a", "b", "b1", "c", "x", "x1", "y", "zzz")
         delete_later(alone, "b", "c")

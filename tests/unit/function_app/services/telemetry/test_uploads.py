@@ -218,6 +218,17 @@ def test_unregistered_uploads_are_deleted_with_their_blob(cloud: Cloud, anna: Pe
     assert rows(cloud, robot) == 0
 
 
+def test_an_upload_after_the_deletion_of_a_capture_leaves_nothing(cloud: Cloud, anna: Person, robot: Robot) -> None:
+    request = begin(anna, robot)
+    send(cloud, request, PICTURE)
+    assert complete(anna, robot, request["id"]).status_code == 200
+    assert anna.delete(f"/devices/{robot.device}/uploads/{request['id']}").status_code == 204
+    assert send(cloud, request, PICTURE).status_code == 201
+    cloud.clock.advance(UNREGISTERED_MS / 1000)
+    delete_due(cloud)
+    assert blobs(cloud) == ()
+
+
 def test_a_registered_capture_is_deleted_after_its_retention(cloud: Cloud, anna: Person, robot: Robot) -> None:
     upload = uploaded(anna, robot)
     cloud.clock.advance(29 * DAY_S)

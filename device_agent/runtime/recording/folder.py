@@ -1,0 +1,175 @@
+"""Files of recordings, and their deletion by age and size.
+
+``{device}/{epoch}/{segment}.mcap`` is a complete segment, ``.overview.json`` its overview, ``.uploaded`` marks that the
+cloud has both, and ``.live`` is a segment that is being written or that a crash has left.
+"""
+
+import contextlib
+import os
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from device_agent.runtime.recording.messages import RecordingLimits
+
+_SEGMENT = re.compile(r"\A(\d{4,})\.(?:mcap|live)\Z")
+_OWNER = "owner"
+MODE, FOLDER_MODE = 0o600, 0o700
+
+
+@dataclass(frozen=True, slots=True)
+class StoredSegment:
+    """A complete segment.
+
+    Attributes:
+        path: The MCAP file.
+        device: Name of the device.
+        epoch: Epoch of the session.
+        segment: Number of the segment.
+        size: Size of all its files [bytes].
+        uploaded: Whether the cloud has it.
+        at_s: When it was completed, on the wall clock [s since 1970].
+    """
+
+    path: Path
+    device: str
+    epoch: int
+    segment: int
+    size: int
+    uploaded: bool
+    at_s: float
+
+
+class RecordingFolder:
+    """The recordings of one agent. The constructor does not access the disk."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def claim(self, owner: str) -> None:
+        """Delete recordings of a former owner. ``owner``: space and account of the present one.
+
+        Raises:
+            OSError: They cannot be deleted.
+        """
+        marker = self.folder / _OWNER
+        if self.folder.is_dir() and (not marker.exists() or marker.read_text(encoding="utf-8") != owner):
+            shutil.rmtree(self.folder)
+        self.folder.mkdir(mode=FOLDER_MODE, exist_ok=True)
+        with contextlib.suppress(FileExistsError), os.fdopen(create(marker), "w", encoding="utf-8") as file:
+            file.write(owner)
+
+    def live_path(self, device: str, epoch: int, lowest: int) -> Path:
+        """Path for a new segment after all others of the session, with the number ``lowest`` or a higher one.
+
+        Raises:
+            OSError: The folder cannot be created.
+        """
+        folder = self.folder / device / f"{epoch:010}"
+        for each in (self.folder, folder.parent, folder):
+            each.mkdir(mode=FOLDER_MODE, exist_ok=True)
+        numbers = [int(match[1]) for path in folder.iterdir() if (match := _SEGMENT.match(path.name))]
+        return folder / f"{max([lowest, *(number + 1 for number in numbers)]):04}.live"
+
+    def live(self) -> list[Path]:
+        """Segments that are not complete, oldest first."""
+        return sorted(self.folder.glob("*/*/*.live"))
+
+    def segments(self) -> list[StoredSegment]:
+        """Complete segments, oldest first."""
+        found = []
+        for path in self.folder.glob("*/*/*.mcap"):
+            with contextlib.suppress(FileNotFoundError, ValueError):
+                status, overview = path.stat(), overview_of(path)
+                size = status.st_size + (overview.stat().st_size if overview.exists() else 0)
+                epoch, segment = int(path.parent.name), int(path.stem)
+                uploaded, device = uploaded_of(path).exists(), path.parent.parent.name
+                found.append(StoredSegment(path, device, epoch, segment, size, uploaded, status.st_mtime))
+        return sorted(found, key=lambda each: (each.at_s, each.device, each.epoch, each.segment))
+
+    def pending(self, device: str, epoch: int) -> tuple[int, ...]:
+        """Numbers of the segments of a session that are not uploaded, also those that are being written or sealed."""
+        folder = self.folder / device / f"{epoch:010}"
+        paths = [*folder.glob("*.mcap"), *folder.glob("*.live")]
+        return tuple(sorted({int(path.stem) for path in paths if not uploaded_of(path).exists()}))
+
+    def free_bytes(self) -> int:
+        """Free space of the disk [bytes]."""
+        return shutil.disk_usage(self.folder).free
+
+    def enforce(self, limits: RecordingLimits, *, now_s: float) -> int:
+        """Delete segments that are too old or beyond the size, uploaded ones first.
+
+        A disk that is almost full ends the deletion of uploaded segments only: the only copy is not deleted because
+        another program needs space.
+
+        Args:
+            limits: Limits.
+            now_s: Wall clock [s since 1970].
+
+        Returns:
+            Number of deleted segments that were not uploaded.
+
+        Raises:
+            OSError: A file cannot be deleted.
+        """
+        lost, kept = 0, []
+        for each in self.segments():
+            if now_s - each.at_s > limits.max_age_s:
+                delete(each.path)
+                lost += not each.uploaded
+            else:
+                kept.append(each)
+        used = sum(each.size for each in kept) + sum(map(_size, self.live()))
+        for each in sorted(kept, key=lambda each: not each.uploaded):
+            full = each.uploaded and self.free_bytes() < limits.min_free_bytes
+            if used <= limits.max_bytes and not full:
+                continue
+            delete(each.path)
+            used -= each.size
+            lost += not each.uploaded
+        return lost
+
+    def used_bytes(self) -> int:
+        """Size of all recordings [bytes]."""
+        return sum(each.size for each in self.segments()) + sum(map(_size, self.live()))
+
+
+def overview_of(segment: Path) -> Path:
+    """Path of the overview of a segment."""
+    return segment.with_suffix(".overview.json")
+
+
+def uploaded_of(segment: Path) -> Path:
+    """Path of the file that marks a segment as uploaded."""
+    return segment.with_suffix(".uploaded")
+
+
+def delete(segment: Path) -> None:
+    """Delete the files of a segment, and its folders if they are empty.
+
+    Raises:
+        OSError: A file cannot be deleted.
+    """
+    for path in (segment, overview_of(segment), uploaded_of(segment)):
+        path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # not empty
+        segment.parent.rmdir()
+        segment.parent.parent.rmdir()
+
+
+def create(path: Path) -> int:
+    """Create a file for this user only; returns its descriptor.
+
+    Raises:
+        OSError: It exists, or cannot be created.
+    """
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, MODE)
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:  # it has been completed
+        return 0

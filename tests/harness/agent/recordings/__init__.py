@@ -1,0 +1,1 @@
+"""Recorded agents and devices, and recordings for tests."""
