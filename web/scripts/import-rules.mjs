@@ -5,11 +5,11 @@ import { dirname, relative, resolve } from "node:path";
 
 const MODELS = [
   ...["account", "keyframes", "movements", "robot-types", "sharing", "spaces", "steering"],
-  ...["pairing", "twin", "devices", "actions", "latency", "control", "sensors", "health"],
+  ...["pairing", "twin", "devices", "actions", "latency", "control", "sensors", "health", "autonomy"],
 ];
 const COMPONENTS = [
-  ...["help", "sharing", "account", "twin", "devices", "pairing", "robot-types", "control", "sensors", "health"],
-  ...["spaces", "steering", "actions", "latency", "keyframes", "movements"],
+  ...["sharing", "account", "twin", "devices", "pairing", "robot-types", "control", "sensors", "health"],
+  ...["spaces", "steering", "actions", "latency", "keyframes", "movements", "autonomy"],
 ];
 const SOURCE = resolve(import.meta.dirname, "../src");
 

@@ -107,7 +107,9 @@ function CurrentPage(props: Omit<PageProps, keyof RouteParameters>) {
     };
   }, [name]);
   const Page = LAZY_PAGES.get(page)?.Page;
-  return Page === undefined ? null : <Page key={`${page} ${Object.values(at).join()}`} {...props} {...at} />;
+  // What is compared on a page changes without loading the page again.
+  const key = `${page} ${Object.values({ ...at, other: "" }).join()}`;
+  return Page === undefined ? null : <Page key={key} {...props} {...at} />;
 }
 
 async function checkSession(api: Api, session: Session): Promise<void> {

@@ -21,7 +21,7 @@ export interface PageProps extends RouteParameters {
 }
 
 type Loaded = Promise<ComponentType<PageProps>>;
-type Part = "account" | "administration" | "devices" | "health" | "movements" | "robotTypes" | "latency";
+type Part = "account" | "administration" | "devices" | "health" | "movements" | "robotTypes" | "latency" | "timeline";
 
 interface Page {
   readonly title: string | ((at: RouteParameters, fleet: Fleet) => string);
@@ -84,6 +84,16 @@ export const PAGES = {
     part: "movements",
     load: async (): Loaded => (await import("../features/movements/editor-page")).EditorPage,
   },
+  tasks: {
+    title: ({ robotType }: RouteParameters): string => texts.pages.tasksOf(robotType.replaceAll("_", " ")),
+    part: "robotTypes",
+    load: async (): Loaded => (await import("../features/autonomy/tasks/list-page")).TaskListPage,
+  },
+  task: {
+    title: ({ name }: RouteParameters): string => name.replaceAll("_", " "),
+    part: "robotTypes",
+    load: async (): Loaded => (await import("../features/autonomy/tasks/page")).TaskPage,
+  },
   typeKeyframes: {
     title: texts.pages.keyframes,
     part: "movements",
@@ -121,6 +131,22 @@ export const PAGES = {
     title: (at: RouteParameters, fleet: Fleet): string => texts.pages.latencyOf(device(at.device, fleet)),
     part: "latency",
     load: latency,
+  },
+  deviceAutonomy: {
+    title: (at: RouteParameters, fleet: Fleet): string => texts.pages.autonomyOf(device(at.device, fleet)),
+    part: "devices",
+    load: async (): Loaded => (await import("../features/autonomy/page")).AutonomyPage,
+  },
+  timeline: {
+    title: texts.sections.timeline,
+    part: "timeline",
+    link: texts.sections.timeline,
+    load: async (): Loaded => (await import("../features/autonomy/fleet-timeline/page")).FleetTimelinePage,
+  },
+  session: {
+    title: (at: RouteParameters, fleet: Fleet): string => texts.pages.sessionOf(device(at.device, fleet)),
+    part: "devices",
+    load: async (): Loaded => (await import("../features/autonomy/recording/page")).SessionPage,
   },
   administration: {
     title: texts.sections.administration,

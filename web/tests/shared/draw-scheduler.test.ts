@@ -36,3 +36,17 @@ it("draws the views in turn, one per frame, and limits their share of the time",
   await vi.advanceTimersByTimeAsync(1_000);
   expect(drawn).toEqual(before);
 });
+
+it("draws a view that follows the pointer in each frame, at any cost", async () => {
+  let drawn = 0;
+  const slot = new DrawSlot(() => {
+    drawn += 1;
+    vi.setSystemTime(Date.now() + COST_MS);
+  });
+  for (let passed = 0; passed < 1_600; passed += 16) {
+    slot.request(true);
+    await vi.advanceTimersByTimeAsync(16);
+  }
+  expect(drawn).toBeGreaterThan(90);
+  slot.dispose();
+});

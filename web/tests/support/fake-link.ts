@@ -40,8 +40,14 @@ export class FakeLink implements Link {
     this.status.value = { state, reason: "" };
   }
 
+  /** The filters of all subscriptions. */
+  filters(): string[] {
+    return [...this.#receivers].map(([filter]) => filter);
+  }
+
   deliver(topic: string, message: object | string): void {
-    const payload = new TextEncoder().encode(typeof message === "string" ? message : JSON.stringify(message));
+    const text = typeof message === "string" ? message : JSON.stringify(message);
+    const payload = message instanceof Uint8Array ? message : new TextEncoder().encode(text);
     for (const [filter, receiver] of this.#receivers) if (matches(filter, topic)) receiver(topic, payload, false);
   }
 }

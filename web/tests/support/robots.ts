@@ -21,6 +21,7 @@ export function head(): Robot {
     expressions: ["smile"],
     behaviours: [],
     capabilities: ["joints", "speech"],
-    actions: ["move_joints", "say", "express", "take_posture", "drive", "go_to"],
+    actions: ["move_joints", "say", "express", "take_posture", "drive", "go_to", "set_control"],
+    controls: [{ name: "gripper", label: "Gripper", unit: "mm", lower: 0, upper: 85 }],
   };
 }

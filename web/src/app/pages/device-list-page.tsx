@@ -1,6 +1,6 @@
 import { DeviceLists, deviceTexts as texts, faultsOf, OperateSelected } from "../../features/devices";
 import { type DeviceFilter, type DeviceStore, type Fleet, type KindFilter, matchesFilter, type OwnerFilter } from "../../features/devices/model";
-import { FirstSteps } from "../../features/help";
+import { FirstSteps } from "../../shared/help";
 import { SpaceList } from "../../features/spaces";
 import { Choice } from "../../shared/ui/choice";
 import { useMemo, useState } from "preact/hooks";

@@ -2,10 +2,10 @@ import type { Account } from "../../shared/api/types";
 import { ActionCards, RunStatusPanel } from "../../features/actions";
 import { ControlBar, StopBanner, useDeviceSessions } from "../../features/control";
 import type { DeviceSession } from "../../features/control/model";
-import { deviceTexts as texts, EventLog, LastSeenAge, RateNotice, ReachChip, RenameDevice } from "../../features/devices";
+import { CameraConsentCard, deviceTexts as texts, EventLog, LastSeenAge, RateNotice, ReachChip, RenameDevice } from "../../features/devices";
 import type { DeviceStore, Fleet } from "../../features/devices/model";
 import { HealthChip } from "../../features/health";
-import { PageExplainer } from "../../features/help";
+import { PageExplainer } from "../../shared/help";
 import { CommandTraceCard } from "../../features/latency";
 import { MovementsCard } from "../../features/movements";
 import { CameraSwitcher, SettingsCard, useCameraSources } from "../../features/sensors";
@@ -20,7 +20,7 @@ import { common } from "../../shared/i18n/common";
 import { RoomDevicePage } from "./room-device-page";
 import "./robot-page.css";
 import { CollapsibleCard } from "../../shared/ui/collapsible-card";
-import { deviceListAddress, keyframesAddress, replaceWith, spaceAddress, latencyAddressOf } from "../../shared/routing/routes";
+import { autonomyAddressOf, deviceListAddress, keyframesAddress, replaceWith, spaceAddress, latencyAddressOf } from "../../shared/routing/routes";
 
 interface DevicePageProps {
   api: Api;
@@ -122,6 +122,11 @@ function RobotColumns({ api, fleet, session, account, access }: RobotColumnsProp
             <CameraSwitcher device={device} views={views} />
           </CollapsibleCard>
         )}
+        {(device.state.value?.camera_consent ?? null) !== null && (
+          <CollapsibleCard name="consent" title={texts.cards.consent} type={type}>
+            <CameraConsentCard api={api} device={device} />
+          </CollapsibleCard>
+        )}
         <CollapsibleCard name="plot" title={texts.cards.plot} type={type}>
           <TelemetryPlot device={device} />
         </CollapsibleCard>
@@ -180,6 +185,7 @@ function DeviceAccess({ api, fleet, device, account }: OperateProps) {
 function Heading({ api, device, fleet }: { api: Api; device: DeviceStore; fleet: Fleet }) {
   const info = device.info.value;
   const parseError = device.parseError.value;
+  const robot = (device.description.value?.joints.length ?? 0) > 0;
   return (
     <div class="heading">
       <a href={deviceListAddress}>← {common.allDevices}</a>
@@ -194,10 +200,15 @@ function Heading({ api, device, fleet }: { api: Api; device: DeviceStore; fleet:
         <a class="chip" href={latencyAddressOf(device.id)}>
           {texts.pages.latency}
         </a>
+        {robot && (
+          <a class="chip" href={autonomyAddressOf(device.id)} data-testid="to-autonomy">
+            {texts.pages.autonomy}
+          </a>
+        )}
         <span class="quiet">
           {texts.list.lastSeen}: <LastSeenAge device={device} />
         </span>
-        {(device.description.value?.joints.length ?? 0) > 0 && (
+        {robot && (
           <a href={keyframesAddress(info.id)} data-testid="to-keyframes">
             {texts.cards.keyframes}
           </a>

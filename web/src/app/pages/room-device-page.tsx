@@ -1,6 +1,6 @@
 /** The page of a device without joints: one card for each capability in its description. */
 import { ActionCards } from "../../features/actions";
-import { EventLog } from "../../features/devices";
+import { CameraConsentCard, EventLog } from "../../features/devices";
 import type { DeviceSession } from "../../features/control/model";
 import type { Fleet } from "../../features/devices/model";
 import { FloorPlan } from "../../features/spaces";
@@ -16,6 +16,7 @@ import type { KnownDescription } from "../../shared/mqtt/parse-messages";
 const IMAGE = "image";
 const DEPTH = "depth";
 const SCAN = "scan";
+const PEOPLE = "people";
 const RANGE = "range";
 const SETTINGS = "settings";
 const POSITIONS = "positions";
@@ -40,19 +41,22 @@ export function RoomDevicePage({ api, fleet, session, access }: RoomDevicePagePr
   });
   const description = device.description.value;
   if (description === null) return null;
-  const hasCamera = description.cameras.length > 0;
+  const colour = description.cameras.filter(({ kind }) => kind === "colour");
+  const hasCamera = colour.length > 0;
   const settings = description.controls.length > 0 && <SettingsCard device={device} roomAction={roomAction} />;
   const has = (name: string): boolean => description.captures.includes(name);
   return (
     <div class="desk room">
       <div class="column">
-        {description.cameras.map(({ name }) => (
+        {colour.map(({ name }) => (
           <CameraCard key={name} device={device} name={name} roomAction={has(IMAGE) ? roomAction : null} />
         ))}
         {/* Without a camera, settings are the main content; otherwise they are in the second column. */}
         {!hasCamera && settings}
-        {has(DEPTH) && <DepthCard device={device} roomAction={roomAction} />}
-        {(has(SCAN) || measures(description, RANGE)) && (
+        {(has(DEPTH) || streams(description, DEPTH) || streams(description, PEOPLE)) && (
+          <DepthCard device={device} roomAction={has(DEPTH) ? roomAction : null} />
+        )}
+        {(has(SCAN) || streams(description, SCAN) || measures(description, RANGE)) && (
           <LidarCard device={device} roomAction={has(SCAN) ? roomAction : null} />
         )}
         {measures(description, POSITIONS) && <FloorPlan fleet={fleet} space={device.info.value.space} agent={device.info.value.agent} />}
@@ -67,6 +71,7 @@ export function RoomDevicePage({ api, fleet, session, access }: RoomDevicePagePr
         <ActionCards fleet={fleet} session={session} />
         {description.actions.includes("gather") && <CollectDataCard device={device} roomAction={roomAction} />}
         {description.captures.length > 0 && <CapturesCard device={device} roomAction={roomAction} />}
+        <CameraConsentCard api={api} device={device} />
         <EventLog device={device} />
         {access}
       </div>
@@ -78,7 +83,12 @@ function measures(description: KnownDescription, stream: string): boolean {
   return description.streams.some(({ name }) => name === stream);
 }
 
+/** Whether the device streams frames of this kind. */
+function streams(description: KnownDescription, kind: string): boolean {
+  return description.cameras.some((camera) => camera.kind === kind);
+}
+
 function hasOwnCard(description: KnownDescription, stream: string): boolean {
-  if (stream === SETTINGS) return description.cameras.length > 0;
+  if (stream === SETTINGS) return streams(description, "colour");
   return [RANGE, POSITIONS, OCCUPANCY].includes(stream);
 }

@@ -62,6 +62,8 @@ export function entryText(record: AuditRecord, names: Names): string {
       return sentences.moved(caller, target, targetName(text(data, "space"), names));
     case "device-renamed":
       return sentences.renamed(caller, text(data, "label"), target);
+    case "camera-consent-set":
+      return sentences.cameraConsent(caller, list(data, "cameras"), target);
     case "shared":
       return sentences.shared(caller, target, otherAccount(data, names), role(data), until(data["expires_ms"]));
     case "unshared":
@@ -122,6 +124,11 @@ const NEVER_MS = Date.UTC(9000, 0);
 
 function until(ms: unknown): string {
   return format.until(typeof ms === "number" && ms < NEVER_MS ? new Date(ms).toISOString() : null);
+}
+
+function list(data: AuditRecord["data"], name: string): string {
+  const value = data[name];
+  return Array.isArray(value) ? value.map(String).join(", ") : "";
 }
 
 function text(data: AuditRecord["data"], name: string): string {

@@ -175,6 +175,7 @@ export const texts = {
       "agent-unpaired": "Agent unpaired",
       "agent-moved": "Agent moved",
       "device-renamed": "Device renamed",
+      "camera-consent-set": "Recording of cameras decided",
       shared: "Access granted",
       unshared: "Access removed",
       invited: "Invitation created",
@@ -224,6 +225,8 @@ export const texts = {
       moved: (caller: string, agent: string, space: string): string => `${caller} moved the agent ${agent} to ${space}.`,
       renamed: (caller: string, label: string, on: string): string =>
         label === "" ? `${caller} reset the name of ${on}.` : `${caller} renamed ${on} to “${label}”.`,
+      cameraConsent: (caller: string, cameras: string, on: string): string =>
+        cameras === "" ? `${caller} allowed no camera of ${on} to be recorded.` : `${caller} allowed recording of cameras of ${on}: ${cameras}.`,
       shared: (caller: string, subject: string, other: string, role: string, until: string): string =>
         `${caller} shared ${subject} with ${other} as ${role.toLowerCase()}, ${until}.`,
       unshared: (caller: string, subject: string, other: string): string => `${caller} removed ${other}’s access to ${subject}.`,

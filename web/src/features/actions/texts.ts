@@ -3,6 +3,7 @@ import type { AnyRequest } from "../../shared/api/action-requests";
 
 const activity: Readonly<Record<string, string>> = {
   run_movement: "movement",
+  run_trial: "trial",
   move_joints: "joint motion",
   move_pose: "motion to a pose",
   say: "speech",
@@ -84,6 +85,7 @@ export function describeRequest(request: AnyRequest | { kind: "stream" }): strin
     case "stream":
       return "Steering";
     case "run_movement":
+    case "run_trial":
     case "run_behaviour":
     case "express":
     case "take_posture":

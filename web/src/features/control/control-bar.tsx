@@ -29,6 +29,7 @@ export function ControlBar({ session, watchers }: ControlBarProps) {
   return (
     <div class="control-bar" role="region" aria-label={texts.control.title}>
       <ControlState session={session} />
+      <RecordingChip device={device} />
       {watchers !== undefined && <WatchersButton watchers={watchers} open={open} names={names} onToggle={() => setOpen(!open)} />}
       <LeaseButton device={device} control={control} />
       {!takingOver && mayTakeOver(device, control) && (
@@ -57,6 +58,23 @@ export function ControlBar({ session, watchers }: ControlBarProps) {
       <AnswerRequest control={control} />
       {watchers !== undefined && open && <WatcherNames watchers={watchers} id={names} />}
     </div>
+  );
+}
+
+/** What is being recorded now; nothing without a recording or while the device's state is not current. */
+function RecordingChip({ device }: { device: DeviceStore }) {
+  const state = device.state.value;
+  const cameras = state?.recorded_cameras ?? [];
+  if (!device.live.value || state === null || (!state.recording && cameras.length === 0)) return null;
+  const chip = { class: "chip control-recording", "data-testid": "recording" };
+  return cameras.length > 0 ? (
+    <span {...chip} data-cameras={cameras.join(" ")} title={texts.control.camerasExplained(cameras.join(", "))}>
+      {texts.control.recordingCameras}
+    </span>
+  ) : (
+    <span {...chip} title={texts.control.recordingExplained}>
+      {texts.control.recording}
+    </span>
   );
 }
 

@@ -8,7 +8,7 @@ import type { ComponentChildren } from "preact";
 import type { Api } from "../../shared/api/client";
 import type { DeviceSession } from "./model/device-session";
 import { common } from "../../shared/i18n/common";
-import { deviceAddress, deviceListAddress, healthAddressOf, latencyAddressOf } from "../../shared/routing/routes";
+import { autonomyAddressOf, deviceAddress, deviceListAddress, healthAddressOf, latencyAddressOf } from "../../shared/routing/routes";
 import { useDeviceSessions } from "./device-sessions";
 import "./page-frame.css";
 
@@ -17,7 +17,7 @@ interface DeviceFrameProps {
   fleet: Fleet;
   account: Account;
   id: string;
-  page: "health" | "latency";
+  page: "health" | "latency" | "autonomy" | "session";
   children: (session: DeviceSession) => ComponentChildren;
 }
 
@@ -41,10 +41,14 @@ function DevicePage({ api, fleet, account, device, page, children }: FramedProps
   const [session] = useDeviceSessions(api, fleet, [device], account);
   if (session === undefined) return null;
   const { label } = device.info.value;
+  const joints = device.description.value?.joints.length;
+  // Without joints nothing moves. Before the description arrives, the open page is listed.
+  const robot = joints === undefined ? page === "autonomy" || page === "session" : joints > 0;
   const pages = [
     [texts.pages.device, deviceAddress(device.id), false],
     [texts.pages.health, healthAddressOf("device", device.id), page === "health"],
     [texts.pages.latency, latencyAddressOf(device.id), page === "latency"],
+    ...(robot ? [[texts.pages.autonomy, autonomyAddressOf(device.id), page === "autonomy"] as const] : []),
   ] as const;
   return (
     <>

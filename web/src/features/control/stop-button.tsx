@@ -1,4 +1,4 @@
-import type { DeviceStore } from "../devices/model";
+import { type DeviceStore, newestFault } from "../devices/model";
 import { useState } from "preact/hooks";
 import type { StopSwitch } from "./model/stop";
 import { texts } from "./texts";
@@ -33,12 +33,6 @@ export function StopBanner({ device, stop }: StopBannerProps) {
       {state.kind === "clear" && error !== null && <p class="notice bad">{error}</p>}
     </div>
   );
-}
-
-/** The message of the fault that was present last. */
-function newestFault(device: DeviceStore): string {
-  const faults = device.state.value?.faults ?? [];
-  return [...faults].sort((one, other) => (other.last_ms ?? 0) - (one.last_ms ?? 0))[0]?.message ?? "";
 }
 
 /** The outcome for each stopped robot, below a button that stops several. */

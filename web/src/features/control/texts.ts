@@ -24,6 +24,10 @@ export const texts = {
     tookOver: (holder: string, reason: string): string => `${holder} took over: ${reason}`,
     handed: (to: string): string => `You handed control over to ${to}`,
     dismiss: "OK",
+    recording: "Recording",
+    recordingExplained: "The agent records this session on its disk: commands, measurements and events, no images.",
+    recordingCameras: "Recording with cameras",
+    camerasExplained: (names: string): string => `With the owner's consent, pictures of these cameras are recorded: ${names}.`,
   },
 
   /** Requesting control, answering a request, and the owner's takeover. */

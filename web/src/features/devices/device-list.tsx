@@ -3,6 +3,7 @@ import { LastSeenAge, ReachChip } from "./reach-chip";
 import type { HealthSummary } from "../../shared/api/health";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
+import { holdingFault } from "./model/faults";
 import { isRoomDevice } from "./model/filter";
 import { common } from "../../shared/i18n/common";
 import { accountLabel } from "../../shared/lib/account-label";
@@ -58,7 +59,7 @@ function RobotRow({ device, fleet, line }: { device: DeviceStore; fleet: Fleet; 
         <div>
           <dt>{texts.list.status}</dt>
           <dd>
-            <ReachChip device={device} data-testid="online" />
+            <Status device={device} />
           </dd>
         </div>
         <div>
@@ -93,7 +94,7 @@ function SensorTile({ device, line }: { device: DeviceStore; line: HealthSummary
         {info.label}
         <span class="quiet">{info.kind.replaceAll("_", " ")}</span>
       </a>
-      <ReachChip device={device} data-testid="online" />
+      <Status device={device} />
       {device.reach.value !== "online" && (
         <span class="quiet small">
           <LastSeenAge device={device} />
@@ -101,6 +102,21 @@ function SensorTile({ device, line }: { device: DeviceStore; line: HealthSummary
       )}
       {state !== null && (state.mode !== "idle" || faultsOf(device, line) > 0) && <Activity device={device} line={line} />}
     </li>
+  );
+}
+
+/** The fault that holds the device, then whether it is online. */
+function Status({ device }: { device: DeviceStore }) {
+  const fault = holdingFault(device);
+  return (
+    <span class="status">
+      {fault !== null && (
+        <span class={`chip bad${device.live.value ? "" : " old"}`} data-testid="holding-fault">
+          {texts.list.fault(fault)}
+        </span>
+      )}
+      <ReachChip device={device} data-testid="online" />
+    </span>
   );
 }
 

@@ -1,8 +1,11 @@
 export { actionUnavailableReason, recoveryUnavailableReason, unavailableReason } from "./availability";
 export { DeviceLists, faultsOf } from "./device-list";
 export { EventLog } from "./event-log";
+export { CameraConsentCard } from "./camera-consent-card";
 export { RateNotice } from "./rate-notice";
+export { RecordedCameras } from "./recorded-cameras";
 export { LastSeenAge, ReachChip } from "./reach-chip";
 export { RenameDevice } from "./rename";
 export { OperateSelected } from "./selection";
 export { texts as deviceTexts } from "./texts";
+export { frameStream, useFrames } from "./use-frames";

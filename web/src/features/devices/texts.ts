@@ -19,6 +19,7 @@ export const texts = {
     control: "Controlled by",
     noOperator: "–",
     you: "you",
+    fault: (message: string): string => (message === "" ? "Fault" : `Fault: ${message}`),
     faults: (count: number): string => (count === 1 ? "1 fault" : `${count} faults`),
     running: (name: string): string => `Running: ${name}`,
     pair: "Pair a device",
@@ -47,6 +48,26 @@ export const texts = {
     cancel: "Cancel",
     renamed: (label: string): string => `Renamed to ${label}.`,
     undo: "Undo",
+  },
+
+  consent: {
+    explained:
+      "With the owner's consent, pictures of these cameras are stored with recorded sessions: on the disk of the agent's computer, and in the cloud. Everyone with access to the device can see them there. The people in the room must agree.",
+    recordedNow: "being recorded now",
+    allowed: "recorded in sessions",
+    forbidden: "not recorded",
+    allow: "Allow recording",
+    allowOf: (camera: string): string => `Allow recording of ${camera}`,
+    question: "Do the people in the room agree?",
+    saving: "Saving…",
+    withdraw: "Stop recording",
+    never: "The owner has not decided.",
+    decided: (name: string): string => `Decided by ${name}. Deleting a session's recording deletes its pictures.`,
+    ownerOnly: "Only the owner can change this.",
+    unconfirmed: "The device has not confirmed this yet. It receives the decision when it is connected.",
+    rejected: (reason: string): string => `The device rejected this: ${reason}.`,
+    camerasOf: (label: string, cameras: string): string => `${label} (${cameras})`,
+    inRoom: (names: string): string => `Cameras are being recorded in this room: ${names}.`,
   },
 
   device: {
@@ -82,6 +103,7 @@ export const texts = {
   cards: {
     view: "Live view",
     camera: "Camera",
+    consent: "Recording of cameras",
     plot: "Last 20 seconds",
     poses: "Joint frames",
     steering: "Steering",
@@ -98,10 +120,13 @@ export const texts = {
     device: "Device",
     health: "Health",
     latency: "Latency",
+    autonomy: "Autonomy",
     of: (label: string): string => `Pages of ${label}`,
     title: {
       health: (name: string): string => `Health of ${name}`,
       latency: (name: string): string => `Latency of ${name}`,
+      autonomy: (name: string): string => `Autonomy of ${name}`,
+      session: (name: string): string => `Recorded session of ${name}`,
     },
   },
 };

@@ -3,10 +3,10 @@ import { supports } from "./model/problems";
 import { JointSlider } from "../steering";
 import { Card } from "../../shared/ui/card";
 import { useState } from "preact/hooks";
-import { degrees, radians } from "../../shared/lib/angles";
+import { clamp, degrees, radians } from "../../shared/lib/angles";
 import type { Editor } from "./model/editor";
-import { setAction, setPose, setPosition, setTime, type ActionKind, type KeyframeActions, type Keyframe, type Positions } from "./model/keyframes";
-import type { Joint } from "../../shared/mqtt/protocol.generated";
+import { setAction, setPose, setPosition, setTime, type ActionKind, type ControlValue, type KeyframeActions, type Keyframe, type Positions } from "./model/keyframes";
+import type { Control, Joint } from "../../shared/mqtt/protocol.generated";
 import { texts } from "./texts";
 
 interface KeyframeCardProps {
@@ -171,7 +171,7 @@ function ActionFields({ editor, index, keyframe }: PartProps) {
     ["behaviour", robot.behaviours],
     ["express", robot.expressions],
   ] as const;
-  const { say, drive, go_to: goal } = keyframe;
+  const { say, drive, go_to: goal, set_control: setting } = keyframe;
   if (!Object.keys(texts.actions).some((action) => supports(robot, action as ActionKind))) return null;
   return (
     <fieldset class="kf-keyframe-actions" onFocusOut={() => editor.endGesture()}>
@@ -259,7 +259,92 @@ function ActionFields({ editor, index, keyframe }: PartProps) {
           )}
         </Toggle>
       )}
+      {supports(robot, "set_control") && (
+        <Toggle
+          action="set_control"
+          on={setting !== undefined}
+          onToggle={(on) => set("set_control", on ? { name: robot.controls?.[0]?.name ?? GRIPPER, value: robot.controls?.[0]?.lower ?? 0 } : undefined)}
+        >
+          {setting !== undefined && (
+            <ControlFields
+              controls={robot.controls}
+              setting={setting}
+              onSet={(value) => set("set_control", value)}
+              onEnd={() => editor.endGesture()}
+            />
+          )}
+        </Toggle>
+      )}
     </fieldset>
+  );
+}
+
+/** The name that the drivers give to a gripper. */
+const GRIPPER = "gripper";
+const STEPS = 100;
+
+interface ControlFieldsProps {
+  /** `null`: unknown; the name is typed, and the robot checks it. */
+  controls: readonly Control[] | null;
+  setting: ControlValue;
+  onSet: (setting: ControlValue) => void;
+  onEnd: () => void;
+}
+
+function ControlFields({ controls, setting, onSet, onEnd }: ControlFieldsProps) {
+  const { name, value } = setting;
+  const control = controls?.find((one) => one.name === name);
+  const choose = (chosen: string): void => {
+    const limits = controls?.find((one) => one.name === chosen);
+    onSet({ name: chosen, value: limits === undefined ? value : clamp(value, limits.lower, limits.upper) });
+  };
+  return (
+    <div class="row">
+      <span class="kf-number-field">
+        <label for="kf-control">{texts.control}</label>
+        {controls === null ? (
+          <input
+            id="kf-control"
+            type="text"
+            data-testid="kf-control"
+            required
+            pattern="[A-Za-z0-9_\-]{1,64}"
+            title={texts.controlNames}
+            value={name}
+            onChange={(event) => event.currentTarget.reportValidity() && choose(event.currentTarget.value)}
+          />
+        ) : (
+          <select id="kf-control" data-testid="kf-control" value={name} onChange={(event) => choose(event.currentTarget.value)}>
+            {control === undefined && <option value={name}>{name}</option>}
+            {controls.map((one) => (
+              <option key={one.name} value={one.name}>
+                {one.label}
+              </option>
+            ))}
+          </select>
+        )}
+      </span>
+      {control !== undefined && (
+        <input
+          type="range"
+          data-testid="kf-control-slider"
+          aria-label={control.label}
+          min={control.lower}
+          max={control.upper}
+          step={(control.upper - control.lower) / STEPS}
+          value={value}
+          onInput={(event) => onSet({ name, value: round(event.currentTarget.valueAsNumber) })}
+          onChange={onEnd}
+        />
+      )}
+      <NumberField
+        id="kf-control-value"
+        label={texts.controlValue(control?.unit ?? "")}
+        value={value}
+        digits={2}
+        onSet={(next) => onSet({ name, value: next })}
+      />
+    </div>
   );
 }
 
@@ -268,7 +353,7 @@ function round(value: number): number {
 }
 
 interface ToggleProps {
-  action: "drive" | "go_to";
+  action: "drive" | "go_to" | "set_control";
   on: boolean;
   onToggle: (on: boolean) => void;
   children: preact.ComponentChildren;

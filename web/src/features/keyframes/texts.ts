@@ -56,6 +56,8 @@ export const texts = {
         return `This robot has no “${what.name}”.`;
       case "unsupported":
         return `This robot does not support: ${texts.actions[what.action].toLowerCase()}.`;
+      case "control-range":
+        return `${what.label} can be set from ${what.lower} to ${what.upper} ${what.unit}`.trim() + ".";
       case "too-fast":
         return `${joint} would exceed its ${what.by} limit before this keyframe.`;
       case "times":
@@ -72,6 +74,7 @@ export const texts = {
         return `Stretch to ${what.needs_s.toFixed(2)} s`;
       case "range":
       case "narrowed":
+      case "control-range":
         return "Move into range";
       case "times":
         return "Sort";
@@ -106,6 +109,7 @@ export const texts = {
     say: "Speak",
     drive: "Drive",
     go_to: "Go to a position in the room",
+    set_control: "Gripper or another setting",
   } satisfies Record<ActionKind, string>,
   forward: "forward [m/s]",
   turn: "turn [°/s]",
@@ -113,6 +117,9 @@ export const texts = {
   x: "x [m]",
   y: "y [m]",
   yaw: "yaw [°]",
+  control: "setting",
+  controlNames: "The name of the setting: letters, digits, - and _.",
+  controlValue: (unit: string): string => (unit === "" ? "value" : `value [${unit}]`),
   script: "Save and run",
   name: "Name",
   description: "Description",

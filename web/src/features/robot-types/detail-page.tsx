@@ -12,7 +12,7 @@ import { common } from "../../shared/i18n/common";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { ConfirmButton } from "../../shared/ui/confirm-button";
-import { addRobotTypeAddress, deviceAddress, replaceWith, robotTypesAddress } from "../../shared/routing/routes";
+import { addRobotTypeAddress, deviceAddress, replaceWith, robotTypesAddress, tasksAddress } from "../../shared/routing/routes";
 import { FindingsList } from "./findings-list";
 import { ModelViewer } from "./model-viewer";
 import { StartAgent } from "./start-agent";
@@ -56,6 +56,13 @@ function Loaded({ api, type, devices }: { api: Api; type: RobotType; devices: re
         <StatusChip type={type} />
       </header>
       <p>{type.description}</p>
+      {type.state === "ready" && (
+        <p>
+          <a href={tasksAddress(type.type)} data-testid="to-tasks">
+            {words.tasks}
+          </a>
+        </p>
+      )}
       {upload?.state === "rejected" && <FindingsList findings={readFindings(upload.errors)} level="error" />}
       {upload !== null && <FindingsList findings={readFindings(upload.warnings)} level="warning" />}
       <div class="two">

@@ -1,6 +1,6 @@
 /** All robot types that the account can access. */
 import type { Fleet } from "../devices/model";
-import { PageExplainer } from "../help";
+import { PageExplainer } from "../../shared/help";
 import { useCallback } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import type { RobotType } from "../../shared/api/robot-types";

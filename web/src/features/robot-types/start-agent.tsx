@@ -1,5 +1,5 @@
 /** The next step after adding a robot type: start an agent. */
-import { AgentCommands } from "../help";
+import { AgentCommands } from "../../shared/help";
 import { Card } from "../../shared/ui/card";
 import { texts } from "./texts";
 

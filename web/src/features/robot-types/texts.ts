@@ -1,6 +1,7 @@
 import { format } from "../../shared/i18n/format";
 
 export const texts = {
+  tasks: "Tasks and trials",
   title: "Robot types",
   add: "Add a robot type",
   explained: "A robot type defines what all robots of one kind have in common: joints and limits, capabilities, and the model for display and simulation.",

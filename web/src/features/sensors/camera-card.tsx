@@ -1,22 +1,17 @@
 import { unavailableReason } from "../devices";
-import type { DeviceStore } from "../devices/model";
+import { type DeviceStore, followFrames } from "../devices/model";
 import { Age } from "../../shared/ui/age";
 import { Card } from "../../shared/ui/card";
 import type { ComponentChildren } from "preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
+import { lateAfterMs } from "../../shared/lib/arrivals";
 import { clock, now } from "../../shared/lib/clock";
-import type { CameraFrame } from "../../shared/mqtt/camera-frame";
 import type { RoomDeviceAction } from "./model/room-device-action";
 import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { contentOf } from "./use-capture-content";
 import "./sensors.css";
-
-/** Without a frame for this long, the image is not live [ms]; for a slow camera, three periods. */
-const STALLED_MS = 2_000;
-/** Averaging time of the frame rate [ms]. */
-const RATE_OVER_MS = 3_000;
 
 interface Shown {
   kind: "live" | "still";
@@ -24,6 +19,8 @@ interface Shown {
   height: number;
   /** Arrival time on the page's clock [ms]. */
   at: number;
+  /** Observed period of the stream [ms]; `null` if not known. */
+  everyMs: number | null;
 }
 
 interface CameraCardProps {
@@ -45,15 +42,25 @@ export function CameraCard({ device, name, roomAction, title, aside }: CameraCar
 
   useEffect(() => {
     if (!running) return;
-    const painter = new Painter(canvas, (frame, arrivals) => {
-      setShown({ kind: "live", width: frame.width, height: frame.height, at: arrivals.at(-1) ?? now() });
-      setRate(arrivals.length / Math.max(0.5, Math.min(RATE_OVER_MS, now() - (arrivals[0] ?? 0)) / 1000));
-      setError("");
-    }, () => setError(texts.camera.undecodable));
-    const end = device.watchCamera(name, (frame) => painter.push(frame));
+    let ended = false;
+    const drawn = async (content: Uint8Array): Promise<{ width: number; height: number }> => {
+      const image = await createImageBitmap(new Blob([content.slice()], { type: "image/jpeg" }));
+      const { width, height } = image;
+      // A frame that is decoded after the end must not replace a still image.
+      if (!ended && canvas.current !== null) paint(canvas.current, image);
+      image.close();
+      return { width, height };
+    };
+    const end = followFrames(device, name, "colour", drawn, ({ latest, error }) => {
+      setError(error === "" ? "" : texts.camera.undecodable);
+      if (latest === null) return;
+      canvas.current?.setAttribute("data-sequence", String(latest.sequence));
+      setShown({ kind: "live", ...latest.value, at: latest.at, everyMs: latest.everyMs });
+      setRate(latest.rateHz);
+    });
     return () => {
+      ended = true;
       end();
-      painter.dispose();
     };
   }, [device, name, running]);
 
@@ -64,7 +71,7 @@ export function CameraCard({ device, name, roomAction, title, aside }: CameraCar
       const image = await createImageBitmap(new Blob([await contentOf(taken)], { type: taken.upload.content_type }));
       paint(canvas.current, image);
       setRunning(false);
-      setShown({ kind: "still", width: image.width, height: image.height, at: now() });
+      setShown({ kind: "still", width: image.width, height: image.height, at: now(), everyMs: null });
       image.close();
       setError("");
     } catch (error) {
@@ -74,7 +81,7 @@ export function CameraCard({ device, name, roomAction, title, aside }: CameraCar
 
   const rateHz = device.description.value?.cameras.find((one) => one.name === name)?.rate_hz ?? 1;
   const silentMs = shown === null ? 0 : clock.value - shown.at;
-  const stalled = running && shown?.kind === "live" && silentMs > Math.max(STALLED_MS, 3000 / rateHz);
+  const stalled = running && shown?.kind === "live" && silentMs > lateAfterMs(rateHz, shown.everyMs);
   const old = stalled || (shown?.kind === "live" && !running) || !device.live.value;
   const unavailable = unavailableReason(device);
   return (
@@ -139,58 +146,6 @@ function Caption({ shown, running, rate, rateHz }: CaptionProps) {
   if (kind === "still") return <Age at={at} as={(age) => texts.camera.still(width, height, age)} />;
   if (!running) return <Age at={at} as={texts.camera.stopped} />;
   return <>{texts.camera.live(width, height, format.oneDigit(rate), format.upToOneDigit(rateHz))}</>;
-}
-
-/** Decodes one frame at a time and drops frames that arrive meanwhile, so that the newest is drawn. */
-class Painter {
-  readonly #canvas: { readonly current: HTMLCanvasElement | null };
-  readonly #drawn: (frame: CameraFrame, arrivals: readonly number[]) => void;
-  readonly #failed: () => void;
-  #arrivals: number[] = [];
-  #next: CameraFrame | null = null;
-  #busy = false;
-  #disposed = false;
-
-  constructor(
-    canvas: { readonly current: HTMLCanvasElement | null },
-    drawn: (frame: CameraFrame, arrivals: readonly number[]) => void,
-    failed: () => void,
-  ) {
-    this.#canvas = canvas;
-    this.#drawn = drawn;
-    this.#failed = failed;
-  }
-
-  push(frame: CameraFrame): void {
-    const at = now();
-    this.#arrivals = [...this.#arrivals.filter((one) => one > at - RATE_OVER_MS), at];
-    this.#next = frame;
-    if (!this.#busy) void this.#work();
-  }
-
-  dispose(): void {
-    this.#disposed = true;
-  }
-
-  async #work(): Promise<void> {
-    this.#busy = true;
-    for (let frame = this.#next; frame !== null; frame = this.#next) {
-      this.#next = null;
-      try {
-        const image = await createImageBitmap(new Blob([frame.jpeg.slice()], { type: "image/jpeg" }));
-        const canvas = this.#canvas.current;
-        if (!this.#disposed && canvas !== null) {
-          paint(canvas, image);
-          canvas.setAttribute("data-sequence", String(frame.sequence));
-          this.#drawn(frame, this.#arrivals);
-        }
-        image.close();
-      } catch {
-        if (!this.#disposed) this.#failed();
-      }
-    }
-    this.#busy = false;
-  }
 }
 
 function paint(canvas: HTMLCanvasElement, image: ImageBitmap): void {

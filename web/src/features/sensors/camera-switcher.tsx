@@ -26,7 +26,9 @@ export function useCameraSources(fleet: Fleet, device: DeviceStore): readonly Vi
     return () => unsubscribers.forEach((end) => end());
   }, [ids]);
   return [device, ...others].flatMap((one) =>
-    (one.description.value?.cameras ?? []).map(({ name }) => ({ key: `${one.id}/${name}`, device: one, camera: name })),
+    (one.description.value?.cameras ?? [])
+      .filter(({ kind }) => kind === "colour")
+      .map(({ name }) => ({ key: `${one.id}/${name}`, device: one, camera: name })),
   );
 }
 

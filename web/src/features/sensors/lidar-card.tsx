@@ -1,13 +1,16 @@
-import { unavailableReason } from "../devices";
+import { frameStream, unavailableReason, useFrames } from "../devices";
 import type { DeviceStore } from "../devices/model";
 import type { Values } from "../spaces/model";
 import { Age } from "../../shared/ui/age";
 import { Card } from "../../shared/ui/card";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
-import { now } from "../../shared/lib/clock";
+import { useVisible } from "../../shared/hooks/use-visible";
+import { clock, now } from "../../shared/lib/clock";
+import { scanView } from "./model/live-view";
 import type { RoomDeviceAction } from "./model/room-device-action";
-import { readScan, type LidarScan } from "../../shared/mqtt/parse-messages";
+import { readScan, type LidarScan } from "../../shared/mqtt/sensor-frames";
+import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { canvasBox } from "../../shared/ui/hidpi-canvas";
 import { contentOf } from "./use-capture-content";
@@ -21,7 +24,7 @@ interface CapturedScan {
   at: number;
 }
 
-/** Lidar view to scale: live nearest distances per sector, and all beams of a captured scan. */
+/** Lidar view to scale: live nearest distances per sector, and all beams, live or of a captured scan. */
 export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAction: RoomDeviceAction | null }) {
   const canvas = useRef<HTMLCanvasElement>(null);
   const [captured, setCaptured] = useState<CapturedScan | null>(null);
@@ -29,19 +32,28 @@ export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAct
   const [repaint, setRepaint] = useState(0);
   const newest = device.measured(RANGE).value;
   const sectors = sectorsOf(newest?.message.values ?? {});
-  const late = device.late(RANGE);
+  const stream = frameStream(device, "scan");
+  const frames = useFrames(device, "scan", stream?.name ?? null, useVisible(canvas) && captured === null, readScan);
+  const { dots, old } = scanView(
+    captured !== null,
+    stream === null ? null : { latest: frames.latest, rateHz: stream.rate_hz },
+    newest === null ? null : device.late(RANGE),
+    clock.value,
+  );
+  const live = dots === "live" ? frames.latest : null;
+  const scan = captured?.scan ?? live?.value ?? null;
 
   useEffect(() => onColourChange(() => setRepaint((count) => count + 1)), []);
   useEffect(() => {
     if (canvas.current === null) return;
-    return canvasBox(canvas.current, (context, width, height) => draw(context, width, height, sectors, captured?.scan ?? null));
-  }, [newest, captured, repaint]);
+    return canvasBox(canvas.current, (context, width, height) => draw(context, width, height, sectors, scan));
+  }, [newest, scan, repaint]);
 
   const capture = async (): Promise<void> => {
     const found = await roomAction?.capture("scan");
     if (found === null || found === undefined) return;
     try {
-      const scan = readScan(new TextDecoder().decode(await contentOf(found)));
+      const scan = readScan(await contentOf(found));
       setCaptured({ scan, at: now() });
       setError("");
     } catch (error) {
@@ -49,7 +61,8 @@ export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAct
     }
   };
 
-  const nearest = sectors.length === 0 ? null : Math.min(...sectors);
+  const ranges = (scan?.range_m ?? []).filter((m) => m !== null);
+  const nearest = sectors.length > 0 ? Math.min(...sectors) : ranges.length > 0 ? Math.min(...ranges) : null;
   const unavailable = unavailableReason(device);
   return (
     <Card
@@ -57,29 +70,30 @@ export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAct
       class="picture"
       aside={
         nearest !== null && (
-          <span class={`quiet ${late ? "old" : ""}`}>
+          <span class={`quiet ${old ? "old" : ""}`}>
             {texts.scan.nearest} <strong class="value">{texts.depth.read(nearest.toFixed(2))}</strong>
           </span>
         )
       }
     >
-      <div class={`canvas-box scan-box ${late ? "old" : ""}`}>
+      <div class={`canvas-box scan-box ${old ? "old" : ""}`}>
         <canvas
           ref={canvas}
           role="img"
           data-testid="scan"
-          data-beams={captured?.scan.range_m.length ?? 0}
+          data-beams={scan?.range_m.length ?? 0}
+          data-sequence={live?.sequence ?? ""}
           aria-label={nearest === null ? texts.scan.labelEmpty : texts.scan.label(nearest.toFixed(2))}
         />
       </div>
       <p class="quiet small">
         {sectors.length > 0 && `${texts.scan.live} `}
-        {captured === null ? (
-          roomAction !== null && texts.scan.noPoints
-        ) : (
-          <Age at={captured.at} as={(age) => texts.scan.points(captured.scan.range_m.length, age)} />
-        )}
-        {late && newest !== null && <Age at={newest.receivedAt} as={(age) => ` ${texts.room.late(age)}`} />}
+        {captured !== null && <Age at={captured.at} as={(age) => texts.scan.points(captured.scan.range_m.length, age)} />}
+        {live !== null && texts.scan.beams(live.value.range_m.length, format.oneDigit(live.rateHz))}
+        {dots === "waiting" && texts.scan.waiting}
+        {dots === "stalled" && frames.latest !== null && <Age at={frames.latest.at} as={texts.scan.stalled} />}
+        {dots === "none" && roomAction !== null && texts.scan.noPoints}
+        {old && newest !== null && <Age at={newest.receivedAt} as={(age) => ` ${texts.room.late(age)}`} />}
       </p>
       {roomAction !== null && (
         <div class="row">
@@ -93,10 +107,15 @@ export function LidarCard({ device, roomAction }: { device: DeviceStore; roomAct
           >
             {roomAction.busy.value === "capture" ? texts.camera.taking : texts.scan.shot}
           </button>
+          {captured !== null && stream !== null && (
+            <button type="button" data-testid="scan-live" onClick={() => setCaptured(null)}>
+              {texts.scan.showLive}
+            </button>
+          )}
         </div>
       )}
       {roomAction !== null && roomAction.error.value !== "" && <p class="notice bad">{roomAction.error.value}</p>}
-      {error !== "" && <p class="notice bad">{error}</p>}
+      {[error, captured === null ? frames.error : ""].map((message) => message !== "" && <p class="notice bad">{message}</p>)}
     </Card>
   );
 }

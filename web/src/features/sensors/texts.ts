@@ -55,6 +55,10 @@ export const texts = {
     title: "Depth image",
     shot: "Capture depth image",
     again: "Capture again",
+    start: "Start live image",
+    stop: "Stop live image",
+    off: "The live image is off.",
+    waiting: "Waiting for the first image…",
     none: "Capture an image to see distances.",
     label: (near: string, far: string): string =>
       `Depth image in false colours, from ${near} to ${far} m. Arrow keys move the measuring point.`,
@@ -63,6 +67,14 @@ export const texts = {
     hint: "Point at the image, or use the arrow keys, to read a distance.",
     noReading: "Grey: out of range.",
     captured: (width: number, height: number, age: string): string => `${width} × ${height}, captured ${age}`,
+    received: (width: number, height: number, age: string): string => `${width} × ${height}, received ${age}`,
+  },
+
+  people: {
+    title: "Tracked people",
+    name: (id: number): string => `Person ${id}`,
+    count: (count: number): string => (count === 0 ? "No person is tracked." : count === 1 ? "1 person is tracked." : `${count} people are tracked.`),
+    key: "Solid: seen by the sensor. Dashed: inferred.",
   },
 
   scan: {
@@ -71,8 +83,12 @@ export const texts = {
     label: (nearest: string): string => `Lidar view, to scale. Nearest: ${nearest} m.`,
     labelEmpty: "Lidar view; no data yet",
     live: "Arcs: nearest distance in each sector, live.",
+    beams: (count: number, rate: string): string => `Dots: ${count} beams, live, ${rate} Hz.`,
+    waiting: "Dots: waiting for the first scan…",
+    stalled: (age: string): string => `Dots: none. Last scan received ${age}.`,
     points: (count: number, age: string): string => `Dots: ${count} beams of the scan captured ${age}.`,
-    noPoints: "Capture a scan to see every beam.",
+    noPoints: "Capture a scan to see its beams.",
+    showLive: "Show live scan",
     ahead: "forward",
     nearest: "Nearest",
   },

@@ -1,6 +1,6 @@
 import type { Account, Space } from "../../shared/api/types";
 import type { Fleet } from "../devices/model";
-import { PageExplainer } from "../help";
+import { PageExplainer } from "../../shared/help";
 import { AccessList } from "../sharing";
 import { useEffect, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";

@@ -1,4 +1,4 @@
-import { DeviceLists } from "../devices";
+import { DeviceLists, RecordedCameras } from "../devices";
 import type { Fleet } from "../devices/model";
 import { useEffect } from "preact/hooks";
 import { texts } from "./texts";
@@ -25,6 +25,7 @@ export function RoomView({ fleet, id }: { fleet: Fleet; id: string }) {
   );
   return (
     <>
+      <RecordedCameras devices={devices} />
       {withPlan.length === 0 && <p class="quiet">{texts.plan.empty}</p>}
       {withPlan.map((agent) => (
         <FloorPlan key={agent} fleet={fleet} space={id} agent={agent} />

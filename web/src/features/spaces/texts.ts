@@ -23,7 +23,8 @@ export const texts = {
     letter: (index: number): string => String.fromCharCode(65 + (index % 26)),
     empty: "No device in this room publishes positions. Add a room device of the kind “perception”.",
     waiting: "Waiting for data from the room…",
-    label: (count: number): string => `Floor plan with ${count === 1 ? "1 robot or person" : `${count} robots and people`}`,
+    label: (count: number, tracked: number): string =>
+      `Floor plan with ${count === 1 ? "1 robot or person" : `${count} robots and people`}${tracked === 0 ? "" : `, ${format.count(tracked, "tracked skeleton")}`}`,
     stale: (age: string): string => `No recent data. Showing the last known state, ${age}.`,
     person: (name: string): string => (/^person(-\d+)?$/.test(name) ? name.replace("person", "Person").replace("-", " ") : name),
     seen: (age: string): string => `seen ${age}`,
@@ -32,7 +33,7 @@ export const texts = {
     column: { name: "Name", place: "Position (m)", heading: "Heading", seen: "Last seen" },
     sensors: "Room devices",
     place: (x: string, y: string): string => `${x}, ${y}`,
-    key: { taken: "occupied", unknown: "unknown", trail: "last 30 seconds" },
+    key: { taken: "occupied", unknown: "unknown", trail: "last 30 seconds", echo: "lidar", person: "tracked person" },
     heading: (degrees: string): string => degrees,
     metre: "1 m",
   },

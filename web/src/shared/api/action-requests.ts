@@ -11,8 +11,16 @@ interface RunMovementByName {
   parameters?: Record<string, unknown>;
 }
 
+/** Runs one trial of a task; the cloud adds its movement. `seed` null: a random one, if the task resets objects. */
+interface RunTrialByName {
+  kind: "run_trial";
+  name: string;
+  seed: number | null;
+}
+
 type RobotRequest =
   | RunMovementByName
+  | RunTrialByName
   | MoveJoints
   | MovePose
   | Say

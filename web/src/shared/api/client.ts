@@ -1,6 +1,7 @@
 /** The HTTP API calls of the console. The session uses an HttpOnly cookie. */
 import type { Account, Action, ActionCallOptions, ControlPurpose, ControlRequestInfo, Credentials, Device, GrantedLease, LatencyBatch, Lease, Purpose, ResetConfirmation, Series, SignInMethods, Space, StorageUsage, Upload, Watcher, XmppCredentials } from "./types";
 import { AccountApi } from "./account";
+import { AutonomyApi } from "./autonomy";
 import { HealthApi } from "./health";
 import { LatencyApi } from "./latency";
 import { Http, type Page } from "./http";
@@ -10,7 +11,9 @@ import type {
   ApiKey, CreatedApiKey, ApiKeySettings, AuditPage, AuditQuery, Invitation, CreatedInvitation, InvitationSettings, Share,
   SharedRole, Target,
 } from "./sharing";
+import { RecordingsApi } from "./recordings";
 import { RobotTypes } from "./robot-types";
+import { TasksApi } from "./tasks";
 import { Transfers } from "./transfers";
 
 export type { Movement };
@@ -35,10 +38,15 @@ export class Api {
   readonly #http: Http;
   /** The signed-in account. */
   readonly account: AccountApi;
+  /** Sessions and autonomy of devices. */
+  readonly autonomy: AutonomyApi;
   /** Device health. */
   readonly health: HealthApi;
   readonly library: Library;
+  readonly recordings: RecordingsApi;
   readonly robotTypes: RobotTypes;
+  /** Tasks of robot types and their trials. */
+  readonly tasks: TasksApi;
   /** Latency samples. */
   readonly latency: LatencyApi;
   readonly transfers: Transfers;
@@ -46,9 +54,12 @@ export class Api {
   constructor(base = "/api/v1") {
     this.#http = new Http(base);
     this.account = new AccountApi(this.#http);
+    this.autonomy = new AutonomyApi(this.#http);
     this.health = new HealthApi(this.#http);
     this.library = new Library(this.#http);
+    this.recordings = new RecordingsApi(this.#http);
     this.robotTypes = new RobotTypes(this.#http);
+    this.tasks = new TasksApi(this.#http);
     this.latency = new LatencyApi(this.#http);
     this.transfers = new Transfers(this.#http);
   }

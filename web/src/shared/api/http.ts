@@ -39,6 +39,12 @@ interface CallOptions {
   retried?: boolean;
 }
 
+export interface Tagged<T> {
+  body: T;
+  /** null: the response has none. */
+  etag: string | null;
+}
+
 /** All methods throw only `ApiError`. */
 export class Http {
   readonly #base: string;
@@ -68,6 +74,11 @@ export class Http {
   }
 
   async call<T>(method: string, path: string, options: CallOptions = {}): Promise<T> {
+    return (await this.tagged<T>(method, path, options)).body;
+  }
+
+  /** Like `call`, with the ETag of the response. */
+  async tagged<T>(method: string, path: string, options: CallOptions = {}): Promise<Tagged<T>> {
     const headers: Record<string, string> = { Accept: "application/json", ...options.headers };
     if (method !== "GET") Object.assign(headers, { "X-CSRF-Token": this.#csrf }, newTrace());
     if (options.body !== undefined) headers["Content-Type"] = "application/json";
@@ -91,13 +102,13 @@ export class Http {
     const serverMs = response.headers.get("X-Telescope-Time-Ms");
     if (serverMs !== null) updateServerTime(Number(serverMs), sentAt, now());
     const body = parseBody(text, response.status);
-    if (response.ok) return body as T;
+    if (response.ok) return { body: body as T, etag: response.headers.get("ETag") };
     const rejection = problem(response.status, body, response.headers.get("X-Request-Id"));
     // After a new sign-in in another tab the cookie has changed, so use the new session's token.
     if (rejection.code !== "csrf-token" || options.retried === true) throw rejection;
     const { csrf_token: csrf } = await this.call<{ csrf_token: string | null }>("GET", "/accounts/me");
     this.setCsrfToken(csrf ?? "");
-    return this.call(method, path, { ...options, retried: true });
+    return this.tagged(method, path, { ...options, retried: true });
   }
 }
 

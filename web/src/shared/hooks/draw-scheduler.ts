@@ -4,14 +4,15 @@
  */
 import { now } from "../lib/clock";
 
-/** Drawing uses at most this fraction (1/n) of the page's time. */
+/** Drawing uses at most this fraction (1/n) of the page's time, unless a view that follows the pointer needs all of it. */
 const TIME_SHARE = 4;
+const WHOLE_TIME = 1;
 const LONGEST_WAIT_MS = 400;
 /** Frames below this cost are not noticeable [ms]. */
 const FREE_MS = 6;
 
-/** Slots waiting to draw, in the order of their requests. */
-const queue = new Set<DrawSlot>();
+/** Slots waiting to draw, in the order of their requests, and the fraction of time that they may use. */
+const queue = new Map<DrawSlot, number>();
 let scheduled = false;
 
 export class DrawSlot {
@@ -22,9 +23,9 @@ export class DrawSlot {
     this.#draw = draw;
   }
 
-  /** Requests a redraw in one of the next frames. */
-  request(): void {
-    queue.add(this);
+  /** Requests a redraw in one of the next frames. `unlimited`: in the next frame, because the pointer moves only this view. */
+  request(unlimited = false): void {
+    queue.set(this, unlimited ? WHOLE_TIME : TIME_SHARE);
     next();
   }
 
@@ -32,11 +33,14 @@ export class DrawSlot {
     queue.delete(this);
   }
 
-  static next(): void {
-    const [slot] = queue;
-    if (slot === undefined) return;
+  /** Draws the next view; returns its fraction of time. */
+  static next(): number {
+    const [first] = queue;
+    if (first === undefined) return WHOLE_TIME;
+    const [slot, share] = first;
     queue.delete(slot);
     slot.#draw();
+    return share;
   }
 }
 
@@ -45,8 +49,14 @@ function next(): void {
   scheduled = true;
   requestAnimationFrame(() => {
     const startedAt = now();
-    do DrawSlot.next();
+    let share = WHOLE_TIME;
+    do share = Math.max(share, DrawSlot.next());
     while (queue.size > 0 && now() - startedAt < FREE_MS / 2);
+    if (share === WHOLE_TIME) {
+      scheduled = false;
+      next();
+      return;
+    }
     // Without a GPU a frame can exceed its budget; then the next one is delayed.
     setTimeout(() => {
       const tookMs = now() - startedAt;
@@ -55,7 +65,7 @@ function next(): void {
           scheduled = false;
           next();
         },
-        Math.min((TIME_SHARE - 1) * Math.max(0, tookMs - FREE_MS), LONGEST_WAIT_MS),
+        Math.min((share - 1) * Math.max(0, tookMs - FREE_MS), LONGEST_WAIT_MS),
       );
     }, 0);
   });

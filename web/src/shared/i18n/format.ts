@@ -3,6 +3,7 @@ const dateTimeFormat = new Intl.DateTimeFormat("en-GB", { dateStyle: "medium", t
 const oneDigitFormat = new Intl.NumberFormat("en", { minimumFractionDigits: 1, maximumFractionDigits: 1, useGrouping: false });
 const timeFormat = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit" });
 const dayFormat = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short" });
+const utcDayFormat = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short", timeZone: "UTC" });
 const dayAndTimeFormat = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short", hour: "2-digit", minute: "2-digit" });
 
 function oneDigit(value: number): string {
@@ -38,6 +39,7 @@ export const format = {
   until: (at: string | null): string => (at === null ? "until revoked" : `until ${format.dateTime(at)}`),
   time: (ms: number): string => timeFormat.format(ms),
   day: (ms: number): string => dayFormat.format(ms),
+  utcDay: (ms: number): string => utcDayFormat.format(ms),
   /** Without the day if less than twelve hours ago. */
   recentTime: (ms: number): string => (Date.now() - ms < 12 * 3_600_000 ? timeFormat : dayAndTimeFormat).format(ms),
   fileSize: (bytes: number): string =>

@@ -17,6 +17,8 @@ const IDAT = 0x49444154;
 const MAX_PIXELS = 1920 * 1080;
 const BYTES = 2;
 const MM_PER_M = 1000;
+/** Of the compressed data, decompressed at once. Deflate reduces to a thousandth at most. */
+const PIECE_BYTES = 1024;
 
 /** Throws `MessageError`. */
 export async function readDepth(file: Uint8Array): Promise<DepthImage> {
@@ -34,7 +36,7 @@ export async function readDepth(file: Uint8Array): Promise<DepthImage> {
     at = begin + length + 4;
   }
   if (size === null) throw new MessageError("the depth image has no header");
-  return { ...size, depthM: metres(unfiltered(await inflate(parts), size.width, size.height)) };
+  return { ...size, depthM: metres(unfiltered(await inflate(parts, size.height * (size.width * BYTES + 1)), size.width, size.height)) };
 }
 
 function header(view: DataView, at: number): { width: number; height: number } {
@@ -47,19 +49,41 @@ function header(view: DataView, at: number): { width: number; height: number } {
   return { width, height };
 }
 
-async function inflate(parts: Uint8Array<ArrayBuffer>[]): Promise<Uint8Array> {
-  const stream = new Blob(parts).stream().pipeThrough(new DecompressionStream("deflate"));
+/** Stops when there are more than `expected` bytes: a small file can contain gigabytes. */
+async function inflate(parts: Uint8Array<ArrayBuffer>[], expected: number): Promise<Uint8Array> {
+  const reader = pieces(parts).pipeThrough(new DecompressionStream("deflate")).getReader();
+  const out = new Uint8Array(expected);
+  let filled = 0;
   try {
-    return new Uint8Array(await new Response(stream).arrayBuffer());
+    for (let part = await reader.read(); !part.done; part = await reader.read()) {
+      out.set(part.value, filled); // Throws `RangeError` beyond the end.
+      filled += part.value.length;
+    }
   } catch {
+    await reader.cancel().catch(() => undefined);
     throw new MessageError("the depth image is corrupt");
   }
+  if (filled !== expected) throw new MessageError("the depth image is corrupt");
+  return out;
+}
+
+/** Small pieces: a browser may decompress a whole piece before the first byte of it can be read. */
+function pieces(parts: Uint8Array<ArrayBuffer>[]): ReadableStream<Uint8Array<ArrayBuffer>> {
+  const waiting = parts.flatMap((part) =>
+    Array.from({ length: Math.ceil(part.length / PIECE_BYTES) }, (_, index) => part.subarray(index * PIECE_BYTES, (index + 1) * PIECE_BYTES)),
+  );
+  return new ReadableStream({
+    pull(controller) {
+      const next = waiting.shift();
+      if (next === undefined) controller.close();
+      else controller.enqueue(next);
+    },
+  });
 }
 
 /** Reverses the PNG row filters. */
 function unfiltered(raw: Uint8Array, width: number, height: number): Uint8Array {
   const stride = width * BYTES;
-  if (raw.length !== height * (stride + 1)) throw new MessageError("the depth image is corrupt");
   const out = new Uint8Array(height * stride);
   const at = (index: number): number => out[index] ?? 0;
   for (let row = 0; row < height; row += 1) {

@@ -8,7 +8,7 @@ import {
 } from "./checks";
 import type { Pose, Quaternion, Vector3 } from "../lib/vectors";
 import type {
-  Ack, AckStatus, ActionState, BaseLimits, Body, Control, Description, Diagnostic, Event, Fault, Geometry,
+  Ack, AckStatus, ActionState, BaseLimits, Body, CameraConsent, CameraStream, Control, Description, Diagnostic, Event, Fault, Geometry,
   InterlockDescription, Joint, JointTelemetry, LeaseState, Measurements, MimicJoint, Mode, PositionDependentLimit,
   OpenRequest, Presence, Reason, Restriction, RobotBehaviour, State, StopLatch, Stream, TwinJoint, VersionRange,
 } from "./protocol.generated";
@@ -51,6 +51,8 @@ const positionDependentLimit = object<PositionDependentLimit>({ joint: text, dep
 
 const stream = object<Stream>({ name: text, rate_hz: number });
 
+const camera = object<Required<CameraStream>>({ name: text, rate_hz: number, kind: optional(text, "colour") });
+
 const control = object<Required<Control>>({
   name: text,
   label: text,
@@ -92,7 +94,7 @@ const description = object<KnownDescription>({
   behaviours: optional(list(text, MAX_JOINTS), []),
   robot_behaviours: optional(list(robotBehaviour, MAX_JOINTS), []),
   streams: optional(list(stream, MAX_JOINTS), []),
-  cameras: optional(list(stream, MAX_JOINTS), []),
+  cameras: optional(list(camera, MAX_JOINTS), []),
   captures: optional(list(text, MAX_JOINTS), []),
   controls: optional(list(control, MAX_JOINTS), []),
   watchdog_ms: optional(count, 0),
@@ -169,6 +171,16 @@ const state = object<Required<State>>({
   stiffness: optional(byName, {}),
   load: optional(count, 0),
   rates_hz: optional(byName, {}),
+  recording: optional(flag, false),
+  recorded_cameras: optional(list(text, MAX_JOINTS), []),
+  camera_consent: nullable(
+    object<Required<CameraConsent>>({
+      cameras: optional(list(text, MAX_JOINTS), []),
+      by: optional(text, ""),
+      at_ms: optional(count, 0),
+      number: optional(count, 0),
+    }),
+  ),
 });
 
 const measured = list(number, MAX_JOINTS);
@@ -241,7 +253,8 @@ function read<T>(payload: Uint8Array, check: Check<T>, name: string): T {
 
 export type KnownDiagnostic = Required<Diagnostic>;
 
-export type KnownDescription = Required<Omit<Description, "diagnostics" | "mimic_joints" | "robot_behaviours">> & {
+export type KnownDescription = Required<Omit<Description, "cameras" | "diagnostics" | "mimic_joints" | "robot_behaviours">> & {
+  cameras: Required<CameraStream>[];
   robot_behaviours: Required<RobotBehaviour>[];
   diagnostics: KnownDiagnostic[];
   mimic_joints: Required<MimicJoint>[];
@@ -319,34 +332,6 @@ export function readShot(result: unknown): Record<string, Record<string, number 
 /** The result of `set_control`: the applied values. Throws `MessageError`. */
 export function readApplied(result: unknown): Record<string, number> {
   return byName(record(result, "result")["applied"], "result.applied");
-}
-
-/** One lidar revolution from a `scan` capture. `range_m` is `null` for a beam without a return. */
-export interface LidarScan {
-  at_ms: number;
-  angle_rad: number[];
-  range_m: (number | null)[];
-  furthest_m: number;
-}
-
-const MAX_BEAMS = 100_000;
-
-/** The content of a `scan` file. Throws `MessageError`. */
-export function readScan(content: string): LidarScan {
-  let parsed: unknown;
-  try {
-    parsed = JSON.parse(content);
-  } catch {
-    throw new MessageError("scan is not JSON");
-  }
-  const found = object<LidarScan>({
-    at_ms: count,
-    angle_rad: list(number, MAX_BEAMS),
-    range_m: list(nullable(number), MAX_BEAMS),
-    furthest_m: number,
-  })(parsed, "scan");
-  if (found.angle_rad.length !== found.range_m.length) fail("scan.range_m", "as long as angle_rad");
-  return found;
 }
 
 /** `event`. Throws `MessageError`. */

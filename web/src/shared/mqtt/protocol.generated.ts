@@ -36,7 +36,7 @@ export interface VersionRange {
  * actions: Kinds of actions that the device accepts. `postures`, `expressions` and `behaviours` list the
  * names that such actions may use. Empty for older agents.
  * robot_behaviours: Those of the `behaviours` that the robot itself provides.
- * cameras: Camera streams at `cam/{name}`.
+ * cameras: Streams of frames at `cam/{name}`, each of one kind.
  * captures: Raw data that can be captured.
  * controls: Values that can be set.
  * limits: Limits that the agent enforces for every command source. `clearance` and `workspace` are absent if
@@ -69,7 +69,7 @@ export interface Description {
   behaviours?: string[];
   robot_behaviours?: RobotBehaviour[];
   streams?: Stream[];
-  cameras?: Stream[];
+  cameras?: CameraStream[];
   captures?: string[];
   controls?: Control[];
   watchdog_ms?: number;
@@ -153,6 +153,21 @@ export interface Stream {
   /** letters, digits, _ and -, 1 to 64 of them */
   name: string;
   rate_hz: number;
+}
+
+/**
+ * A stream of frames at `cam/{name}`.
+ *
+ * Attributes:
+ * kind: Content of the frames, one of `camera_frames.KINDS`: `colour`, `depth`, `scan` or `people`.
+ * Receivers ignore streams of unknown kinds.
+ */
+export interface CameraStream {
+  /** letters, digits, _ and -, 1 to 64 of them */
+  name: string;
+  rate_hz: number;
+  /** no control and format characters */
+  kind?: string;
 }
 
 /** A value that can be set, between `lower` and `upper` [`unit`]. */
@@ -279,6 +294,10 @@ export interface Geometry {
  * stiffness: Joints that hold with reduced strength: joint name → share of the full strength.
  * load: Which work the agent reduces because its machine is overloaded: 0: none; 1: cameras; 2: also perception;
  * 3: also telemetry. Control is never reduced.
+ * recording: Whether the session is being recorded on the agent's disk.
+ * recorded_cameras: Cameras that are being recorded now, in a session of this robot or, for a room device, of any
+ * robot of its agent: names of own cameras, and `{device}/{camera}` of room devices.
+ * camera_consent: The owner's consent to record cameras; `None`: the device has no camera that can be recorded.
  * rates_hz: Measured rate of each stream and camera: `tele/joints`, `cam/front` → messages a second [Hz]. The
  * configured rates are in `desc`.
  */
@@ -298,6 +317,9 @@ export interface State {
   stiffness?: Record<string, number>;
   load?: number;
   rates_hz?: Record<string, number>;
+  recording?: boolean;
+  recorded_cameras?: string[];
+  camera_consent?: CameraConsent | null;
 }
 
 /** What the device is doing now. */
@@ -377,6 +399,23 @@ export interface Restriction {
 }
 
 /**
+ * The owner's decision which cameras of the device may be recorded, as the agent has stored it.
+ *
+ * Attributes:
+ * cameras: Names of the cameras that may be recorded; empty: none.
+ * by: Name of the account that decided; empty: there was no decision yet.
+ * at_ms: When the agent stored the decision.
+ * number: Number of the decision.
+ */
+export interface CameraConsent {
+  cameras?: string[];
+  /** no control and format characters */
+  by?: string;
+  at_ms?: number;
+  number?: number;
+}
+
+/**
  * `tele/joints`: all joints of one device at one tick, in the order of `Description.joints`.
  *
  * Attributes:
@@ -415,6 +454,52 @@ export interface Measurements {
   at_ms: number;
   sequence: number;
   values: Record<string, number | boolean>;
+}
+
+/**
+ * A frame of the kind `people`: all people that the sensor tracks now.
+ *
+ * Attributes:
+ * position_m: Position of the camera in the room [m].
+ * rotation: Its axes in the room: x to the right, y up, viewing direction -z.
+ * fovy_rad: Its vertical field of view [rad]; pixels are square.
+ * people: The tracked people.
+ */
+export interface TrackedPeople {
+  position_m: [number, number, number];
+  /** rows of the matrix whose columns are the axes in the room */
+  rotation: [[number, number, number], [number, number, number], [number, number, number]];
+  fovy_rad: number;
+  people?: TrackedPerson[];
+}
+
+/**
+ * One tracked person.
+ *
+ * Attributes:
+ * id: Number that stays the same while the person is tracked.
+ * position_m: Centre of the body in the room [m].
+ * joints: Known joints; a joint without an estimate is missing.
+ */
+export interface TrackedPerson {
+  id: number;
+  position_m: [number, number, number];
+  joints?: BodyJoint[];
+}
+
+/**
+ * One joint of a tracked person.
+ *
+ * Attributes:
+ * name: One of the 20 joints of Kinect v1, for example `hand_left`; left and right are those of the person.
+ * position_m: Position in the room [m].
+ * state: `tracked`: the sensor sees the joint. `inferred`: it does not; the position is an estimate.
+ */
+export interface BodyJoint {
+  /** no control and format characters */
+  name: string;
+  position_m: [number, number, number];
+  state: "inferred" | "tracked";
 }
 
 /** `event`: a fact that happened, in the past tense. The cloud stores it. */

@@ -2,7 +2,7 @@
 import { signal, type ReadonlySignal } from "@preact/signals";
 
 /** Route parameters; empty if the address lacks the parameter. */
-export type RouteParameters = Readonly<Record<"device" | "id" | "ids" | "name" | "robotType" | "space", string>>;
+export type RouteParameters = Readonly<Record<"device" | "epoch" | "id" | "ids" | "name" | "other" | "robotType" | "space", string>>;
 
 /** The address of each page: `:name` is a parameter, `:name?` an optional one. */
 const PATTERNS = {
@@ -14,6 +14,8 @@ const PATTERNS = {
   pair: "#/pair",
   movements: "#/movements",
   movement: "#/movements/:robotType/:name",
+  tasks: "#/tasks/:robotType",
+  task: "#/tasks/:robotType/:name",
   typeKeyframes: "#/robot-types/:robotType/keyframes/:name?",
   robotTypes: "#/robot-types",
   robotType: "#/robot-types/:id",
@@ -23,6 +25,9 @@ const PATTERNS = {
   spaceHealth: "#/spaces/:space/health",
   latency: "#/latency",
   deviceLatency: "#/devices/:device/latency",
+  deviceAutonomy: "#/devices/:device/autonomy",
+  timeline: "#/timeline",
+  session: "#/devices/:device/sessions/:epoch/:other?",
   account: "#/account",
   auditLog: "#/account/audit-log",
   administration: "#/administration",
@@ -36,7 +41,7 @@ interface Route {
   at: RouteParameters;
 }
 
-const NO_PARAMETERS: RouteParameters = { device: "", id: "", ids: "", name: "", robotType: "", space: "" };
+const NO_PARAMETERS: RouteParameters = { device: "", epoch: "", id: "", ids: "", name: "", other: "", robotType: "", space: "" };
 
 const EXPRESSIONS: readonly (readonly [PageName, RegExp])[] = (Object.entries(PATTERNS) as [PageName, string][]).map(([name, pattern]) => [
   name,
@@ -103,12 +108,31 @@ export function robotTypeAddress(id: string): string {
   return pageAddress("robotType", { id });
 }
 
+/** The tasks of a robot type. */
+export function tasksAddress(robotType: string): string {
+  return pageAddress("tasks", { robotType });
+}
+
+/** One task with its trials. */
+export function taskAddress(robotType: string, name: string): string {
+  return pageAddress("task", { robotType, name });
+}
+
 export function healthAddressOf(kind: "device" | "space", id: string): string {
   return kind === "device" ? pageAddress("deviceHealth", { device: id }) : pageAddress("spaceHealth", { space: id });
 }
 
 export function latencyAddressOf(device: string): string {
   return pageAddress("deviceLatency", { device });
+}
+
+export function autonomyAddressOf(device: string): string {
+  return pageAddress("deviceAutonomy", { device });
+}
+
+/** The recording of one session of a device. `other`: the session to compare it with, as `selectionText` writes it. */
+export function sessionAddress(device: string, epoch: number, other = ""): string {
+  return pageAddress("session", { device, epoch: String(epoch), other });
 }
 
 export function movementAddress(robotType: string, name: string): string {

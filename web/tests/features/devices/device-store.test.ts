@@ -1,5 +1,6 @@
 import { describe, expect, it } from "vitest";
 import { Fleet } from "../../../src/features/devices/model/device-list";
+import { holdingFault } from "../../../src/features/devices/model/faults";
 import { deliver, device, ends, link, pass, server } from "../../support/console";
 import { list } from "../../support/fake-server";
 import { description, listed, state, telemetry, twin } from "../../support/messages";
@@ -30,6 +31,22 @@ describe("a device", () => {
     expect(device.reach.value).toBe("unknown");
     link.set("up");
     expect(device.reach.value).toBe("online");
+  });
+
+  it("names the newest fault that holds it, also while it is online", () => {
+    const fault = (code: string, since_ms: number): object => ({ code, message: `${code} has failed`, since_ms, last_ms: since_ms });
+    expect(holdingFault(device)).toBeNull();
+    deliver("state", state(2, null, { mode: "idle", faults: [fault("recording", 1)] }));
+    expect(holdingFault(device)).toBeNull(); // it operates in spite of this fault
+    deliver("state", state(2, null, { mode: "fault", faults: [fault("driver.drive", 3), fault("recording", 1)] }));
+    deliver("tele/joints", telemetry({ mode: "fault" }));
+    expect([holdingFault(device), device.reach.value]).toEqual(["driver.drive has failed", "online"]);
+    deliver("state", state(2, null, { mode: "fault", stop: { caller: "ann", reason: "", since_ms: 1 }, faults: [fault("recording", 1), fault("driver.drive", 3)] }));
+    expect(holdingFault(device)).toBe("driver.drive has failed");
+    deliver("state", state(2, null, { mode: "fault", faults: [] }));
+    expect(holdingFault(device)).toBe("");
+    deliver("state", state(2, null, { mode: "idle", faults: [] }));
+    expect(holdingFault(device)).toBeNull();
   });
 
   it("keeps its state after an unreadable message", () => {

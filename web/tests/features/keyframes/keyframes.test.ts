@@ -5,6 +5,7 @@ import { plan } from "../../../src/features/keyframes/model/plan";
 import { type Problem, positionAt, problems, stretchAll } from "../../../src/features/keyframes/model/problems";
 import { Recorder, simplify, keyframesOf, trim, type Sample } from "../../../src/features/keyframes/model/recording";
 import { readMovement, readScript, writeScript } from "../../../src/features/keyframes/model/script-codec";
+import { texts } from "../../../src/features/keyframes/texts";
 import { UndoHistory } from "../../../src/shared/lib/undo-history";
 import type { KnownTelemetry } from "../../../src/shared/mqtt/parse-messages";
 import { head } from "../../support/robots";
@@ -91,6 +92,21 @@ describe("checks", () => {
     expect(fixed.keyframes[2]?.position_rad["pitch"]).toBeCloseTo(-0.4);
   });
 
+  test("name unknown controls and values outside of their limits; a robot type leaves both to its robots", () => {
+    const set = (name: string, value: number): Movement => movement(frame(0, { yaw: 0 }, { set_control: { name, value } }));
+    const fixed = (wrong: Movement): unknown => problems(wrong, robot)[0]?.fix?.(wrong).keyframes[0]?.set_control;
+    expect([kinds(problems(set("gripper", 85), robot)), kinds(problems(set("gripper", -1), robot)), kinds(problems(set("lamp", 1), robot))]).toEqual([
+      [],
+      ["0 - control-range"],
+      ["0 - unknown-name"],
+    ]);
+    expect(problems(set("gripper", 99), robot).map((problem) => texts.problem(problem, ""))).toEqual(["Gripper can be set from 0 to 85 mm."]);
+    expect([fixed(set("gripper", 99)), fixed(set("lamp", 1))]).toEqual([{ name: "gripper", value: 85 }, undefined]);
+    const without = { ...robot, actions: ["move_joints"], controls: [] };
+    expect(kinds(problems(set("gripper", 1), without))).toEqual(["0 - unsupported"]);
+    expect(problems(set("lamp", 99), { ...without, controls: null })).toEqual([]);
+  });
+
   test("state the time that a too fast segment needs; a fix exists for one and for all segments", () => {
     const fast = movement(frame(0, { yaw: 0 }), frame(0.2, { yaw: 1 }), frame(3, { yaw: 0 }));
     const [found] = problems(fast, robot);
@@ -137,6 +153,7 @@ describe("the script", () => {
     frame(0, { yaw: 0 }),
     frame(1.5, { yaw: 0.5, left: -0.25 }, { express: "smile", say: 'He said "no" \\ ž\n' }),
     frame(2, {}, { drive: { forward_m_s: 0.1, turn_rad_s: 0, duration_s: 2 }, go_to: { x_m: 1, y_m: -2 } }),
+    frame(3, {}, { set_control: { name: "gripper", value: 0.4 } }),
   );
 
   test("is read back as it was written", () => {
@@ -164,6 +181,8 @@ describe("the script", () => {
     ["another speed", (source: string) => source.replace('"default": 1', '"default": 2')],
     ["a computed number", (source: string) => source.replace("0.5", "1 / 2")],
     ["an unknown key", (source: string) => source.replace('"express"', '"shout"')],
+    ["a control without a value", (source: string) => source.replace(', "value": 0.4', "")],
+    ["a control that is a text", (source: string) => source.replace('{"name": "gripper", "value": 0.4}', '"gripper"')],
     ["an infinite time", (source: string) => source.replace("1.5", "1e999")],
     ["no keyframe", (source: string) => source.replace(/ {4}\{"time_s.*\n/gu, "")],
     ["no end", (source: string) => source.replace("\n]\n", "\n")],

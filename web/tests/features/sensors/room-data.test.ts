@@ -1,14 +1,15 @@
 import { readFileSync } from "node:fs";
 import { deflateSync } from "node:zlib";
-import { describe, expect, it } from "vitest";
+import { afterEach, describe, expect, it, vi } from "vitest";
 import { assess, quantityOf } from "../../../src/features/sensors/model/quantities";
 import { Recording } from "../../../src/features/sensors/model/stored-series";
 import { separatePins, extent, readFloor, readPlaces } from "../../../src/features/spaces/model/room-perception";
 import { readDepth } from "../../../src/shared/lib/png";
-import { readFrame } from "../../../src/shared/mqtt/camera-frame";
 import { MessageError } from "../../../src/shared/mqtt/checks";
-import { readApplied, readDescription, readMeasurements, readScan, readShot } from "../../../src/shared/mqtt/parse-messages";
+import { readApplied, readDescription, readMeasurements, readShot } from "../../../src/shared/mqtt/parse-messages";
 import { bytes } from "../../support/messages";
+
+afterEach(() => void vi.unstubAllGlobals());
 
 const LIMITS = { low: 5, warning_low: 18, warning_high: 26, high: 35 };
 const thermometer = readDescription(
@@ -48,35 +49,12 @@ describe("messages of a room device", () => {
     expect(() => readShot({ values: { light: 5 } })).toThrow(MessageError);
     expect(() => readApplied({})).toThrow(MessageError);
   });
-
-  it("contain one distance, or none, for each beam of a scan", () => {
-    const scan = (range_m: unknown[]): string => JSON.stringify({ at_ms: 1, angle_rad: [0, 1], range_m, furthest_m: 12, more: 1 });
-    expect(readScan(scan([1.5, null])).range_m).toEqual([1.5, null]);
-    expect(() => readScan(scan([1]))).toThrow(MessageError);
-    expect(() => readScan("<html>")).toThrow("not JSON");
-  });
 });
 
-describe("a camera frame", () => {
-  const header = [0x54, 0x53, 1, 1, 0, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0x10, 0, 1, 0x40, 0, 0xf0];
-
-  it("is read behind its header, at any offset of its buffer", () => {
-    const { sequence, tickMs, width, height, jpeg } = readFrame(Uint8Array.from([9, 9, ...header, 0xff, 0xd8, 1, 2]).subarray(2));
-    expect([sequence, tickMs, width, height, ...jpeg]).toEqual([7, 4096, 320, 240, 0xff, 0xd8, 1, 2]);
-  });
-
-  it.each([
-    ["another version", [0x54, 0x53, 2, ...header.slice(3), 0xff, 0xd8, 1]],
-    ["no JPEG", [...header, 1, 2, 3]],
-    ["no content", header],
-  ])("is rejected with %s", (_, payload) => {
-    expect(() => readFrame(Uint8Array.from(payload))).toThrow(MessageError);
-  });
-});
+const Decompression = DecompressionStream;
 
 /** A 16-bit greyscale PNG whose rows use the five filters in turn. */
 function png(rows: number[][], bits = 16): Uint8Array {
-  const uint32 = (value: number): number[] => [24, 16, 8, 0].map((shift) => (value >> shift) & 255);
   const plain = rows.map((row) => row.flatMap((value) => [value >> 8, value & 255]));
   const filtered = plain.flatMap((row, y) => {
     const coded = row.map((value, x) => {
@@ -88,15 +66,21 @@ function png(rows: number[][], bits = 16): Uint8Array {
     });
     return [y % 5, ...coded];
   });
+  return pngFile(rows[0]?.length ?? 0, rows.length, Uint8Array.from(filtered), bits);
+}
+
+/** A PNG file with these rows. */
+function pngFile(width: number, height: number, filtered: Uint8Array, bits = 16): Uint8Array {
+  const uint32 = (value: number): number[] => [24, 16, 8, 0].map((shift) => (value >> shift) & 255);
   const chunk = (kind: string, body: Iterable<number>): number[] => {
     const content = [...body];
     return [...uint32(content.length), ...new TextEncoder().encode(kind), ...content, 0, 0, 0, 0];
   };
-  const header = [...uint32(rows[0]?.length ?? 0), ...uint32(rows.length), bits, 0, 0, 0, 0];
+  const header = [...uint32(width), ...uint32(height), bits, 0, 0, 0, 0];
   return Uint8Array.from([
     ...[0x89, 0x50, 0x4e, 0x47, 0x0d, 0x0a, 0x1a, 0x0a],
     ...chunk("IHDR", header),
-    ...chunk("IDAT", deflateSync(Uint8Array.from(filtered))),
+    ...chunk("IDAT", deflateSync(filtered)),
     ...chunk("IEND", []),
   ]);
 }
@@ -115,6 +99,32 @@ describe("a depth image", () => {
     for (const content of [whole.slice(0, -20), damaged]) await expect(readDepth(content)).rejects.toThrow(MessageError);
     await expect(readDepth(png([[1, 2]], 8))).rejects.toThrow("16-bit");
     await expect(readDepth(Uint8Array.from([1, 2, 3]))).rejects.toThrow("not a PNG");
+  });
+
+  it("is rejected with missing or excess rows", async () => {
+    await expect(readDepth(pngFile(2, 2, new Uint8Array(9)))).rejects.toThrow("corrupt");
+    await expect(readDepth(pngFile(2, 2, new Uint8Array(11)))).rejects.toThrow("corrupt");
+    expect((await readDepth(pngFile(2, 2, new Uint8Array(10)))).depthM).toHaveLength(4);
+  });
+
+  it("is decompressed no further than its size", async () => {
+    const file = pngFile(100, 100, new Uint8Array(50_000_000));
+    let decompressed = 0;
+    const counted = class {
+      readonly #real = new Decompression("deflate");
+      readonly #counter = new TransformStream<Uint8Array, Uint8Array>({
+        transform: (part, controller) => {
+          decompressed += part.length;
+          controller.enqueue(part);
+        },
+      });
+      readonly writable = this.#real.writable;
+      readonly readable = this.#real.readable.pipeThrough(this.#counter);
+    };
+    vi.stubGlobal("DecompressionStream", counted);
+    await expect(readDepth(file)).rejects.toThrow("corrupt");
+    // What a stream decompresses in advance is allowed.
+    expect(decompressed).toBeLessThan(2_000_000);
   });
 });
 

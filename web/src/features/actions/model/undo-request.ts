@@ -12,6 +12,7 @@ const JOINTS: ReadonlySet<AnyRequest["kind"]> = new Set([
   "look_at",
   "run_behaviour",
   "run_movement",
+  "run_trial",
 ]);
 
 /** The request that reverses `request`; `null`: it is not reversible, or the device's pose is unknown. */

@@ -5,10 +5,11 @@ import { RecentTelemetry } from "../../twin/model";
 import { computed, signal, type ReadonlySignal, type Signal } from "@preact/signals-core";
 import type { Api } from "../../../shared/api/client";
 import { ApiError } from "../../../shared/api/http";
+import { lateAfterMs } from "../../../shared/lib/arrivals";
 import { clock, now, toPageClock } from "../../../shared/lib/clock";
 import type { Link } from "../../../shared/mqtt/mqtt-link";
 import { readAck, readDescription, readEvent, readMeasurements, readPresence, readState, readTelemetry, readTwin, type KnownAck, type KnownDescription, type KnownEvent, type KnownState, type KnownTelemetry, type KnownTwin } from "../../../shared/mqtt/parse-messages";
-import { readFrame, type CameraFrame } from "../../../shared/mqtt/camera-frame";
+import { readFrame, type CameraFrame, type FrameKind } from "../../../shared/mqtt/camera-frame";
 import type { Measurements, Presence } from "../../../shared/mqtt/protocol.generated";
 import { deviceTopics, type DeviceTopics } from "../../../shared/mqtt/topics";
 
@@ -50,10 +51,6 @@ export interface OpenRequest {
   account: string;
   until: number;
 }
-
-/** On the device's own page, a stream that is this late is stale [ms]. */
-const LATE_MS = 1_000;
-const PERIODS = 3;
 
 export class DeviceStore {
   readonly id: string;
@@ -259,8 +256,7 @@ export class DeviceStore {
     const newest = this.#measuredOf(stream).value;
     if (newest === null || !this.#link.up.value) return true;
     const rate = this.#description.value?.streams.find((one) => one.name === stream)?.rate_hz ?? 1;
-    const periodMs = Math.max(1000 / rate, newest.everyMs ?? 0);
-    return clock.value - newest.receivedAt > LATE_MS + PERIODS * periodMs;
+    return clock.value - newest.receivedAt > lateAfterMs(rate, newest.everyMs);
   }
 
   /** Subscribes to the description only. Returns a function that unsubscribes. */
@@ -280,11 +276,11 @@ export class DeviceStore {
     });
   }
 
-  /** Subscribes to a camera's frames. Returns a function that unsubscribes. */
-  watchCamera(name: string, receiver: (frame: CameraFrame) => void): () => void {
+  /** Subscribes to a stream of frames of one kind. Returns a function that unsubscribes. */
+  watchFrames(name: string, kind: FrameKind, receiver: (frame: CameraFrame) => void): () => void {
     return this.#subscribe({
       [this.topics.cam(name)]: (payload) => {
-        receiver(readFrame(payload));
+        receiver(readFrame(payload, kind));
         this.#lastMessageAt.value = now();
       },
     });

@@ -1,1 +1,2 @@
-export { readScript } from "./script-codec";
+export { simplify } from "./recording";
+export { MAX_SCRIPT_LENGTH, readScript } from "./script-codec";

@@ -1,7 +1,7 @@
 /** A movement as keyframes: joint positions and actions at times. All functions are pure and return new objects. */
 import { clamp } from "../../../shared/lib/angles";
 import type { KnownDescription } from "../../../shared/mqtt/parse-messages";
-import type { Joint } from "../../../shared/mqtt/protocol.generated";
+import type { Control, Joint } from "../../../shared/mqtt/protocol.generated";
 
 export type Positions = Readonly<Record<string, number>>;
 
@@ -17,6 +17,12 @@ interface Place {
   yaw_rad?: number;
 }
 
+/** A value of a control of the robot, in the unit of the control. */
+export interface ControlValue {
+  name: string;
+  value: number;
+}
+
 /** Actions at a keyframe, executed in this order while the movement pauses. */
 export interface KeyframeActions {
   posture?: string;
@@ -25,9 +31,10 @@ export interface KeyframeActions {
   say?: string;
   drive?: Drive;
   go_to?: Place;
+  set_control?: ControlValue;
 }
 
-export const ACTION_KINDS = ["posture", "behaviour", "express", "say", "drive", "go_to"] as const;
+export const ACTION_KINDS = ["posture", "behaviour", "express", "say", "drive", "go_to", "set_control"] as const;
 
 export type ActionKind = (typeof ACTION_KINDS)[number];
 
@@ -48,7 +55,10 @@ export interface Movement {
 export type Robot = Pick<
   KnownDescription,
   "joints" | "mimic_joints" | "position_dependent_limits" | "postures" | "expressions" | "behaviours" | "capabilities" | "actions"
->;
+> & {
+  /** `null`: unknown, because a robot type does not declare the controls of its robots. */
+  controls: readonly Control[] | null;
+};
 
 export const MAX_DURATION_S = 600;
 

@@ -1,8 +1,9 @@
 /** Problems of a movement on a robot, and their corrections. */
+import { clamp } from "../../../shared/lib/angles";
 import { segmentsOf, rangeAt } from "./plan";
 import type { Joint } from "../../../shared/mqtt/protocol.generated";
 import { at, Curve, curveOf, MAX_TIME_RATIO, timesOf, type Limiting } from "./timeline-layout";
-import { ACTION_KINDS, type ActionKind, type Movement, type Robot, MAX_DURATION_S, MIN_INTERVAL_S, MAX_TEXT_LENGTH, TOLERANCE_RAD, normalize, roundTime, withKeyframe, setAction, setTime, startAtZero, inJointOrder } from "./keyframes";
+import { ACTION_KINDS, type ActionKind, type ControlValue, type Movement, type Robot, MAX_DURATION_S, MIN_INTERVAL_S, MAX_TEXT_LENGTH, TOLERANCE_RAD, normalize, roundTime, withKeyframe, setAction, setTime, startAtZero, inJointOrder } from "./keyframes";
 
 /** A problem at one keyframe, and its fix. A `warning` does not prevent running. */
 export interface Problem {
@@ -17,6 +18,7 @@ export interface Problem {
     | { kind: "unknown-joint" }
     | { kind: "unknown-name"; action: ActionKind; name: string }
     | { kind: "unsupported"; action: ActionKind }
+    | { kind: "control-range"; label: string; lower: number; upper: number; unit: string }
     | { kind: "too-fast"; by: Limiting; needs_s: number }
     | { kind: "times" }
     | { kind: "late-joint" }
@@ -123,9 +125,25 @@ function actionProblems(movement: Movement, index: number, robot: Robot): Proble
     if ((action === "posture" || action === "behaviour" || action === "express") && typeof value === "string") {
       if (!robot[NAMES[action]].includes(value)) return [{ ...base, what: { kind: "unknown-name", action, name: value }, fix }];
     }
+    if (action === "set_control" && keyframe.set_control !== undefined) return controlProblems(keyframe.set_control, index, robot);
     const long = action === "say" && typeof value === "string" && value.length > MAX_TEXT_LENGTH;
     return long ? [{ ...base, what: { kind: "too-long-text" }, fix: null }] : [];
   });
+}
+
+/** The control does not exist, or the value is outside of its limits. */
+function controlProblems({ name, value }: ControlValue, index: number, { controls }: Robot): Problem[] {
+  if (controls === null) return [];
+  const base = { severity: "error", keyframe: index, joint: null } as const;
+  const control = controls.find((one) => one.name === name);
+  if (control === undefined) {
+    const what = { kind: "unknown-name", action: "set_control", name } as const;
+    return [{ ...base, what, fix: (old) => setAction(old, index, "set_control", undefined) }];
+  }
+  const { label, unit = "", lower, upper } = control;
+  if (value >= lower && value <= upper) return [];
+  const fix = (old: Movement): Movement => setAction(old, index, "set_control", { name, value: clamp(value, lower, upper) });
+  return [{ ...base, what: { kind: "control-range", label, lower, upper, unit }, fix }];
 }
 
 const ACTIONS: Readonly<Record<ActionKind, string>> = {
@@ -135,11 +153,12 @@ const ACTIONS: Readonly<Record<ActionKind, string>> = {
   say: "say",
   drive: "drive",
   go_to: "go_to",
+  set_control: "set_control",
 };
 
-/** Whether the robot's description supports an action. */
+/** Whether the robot's description supports an action, or does not exclude it. */
 export function supports(robot: Robot, action: ActionKind): boolean {
-  return robot.actions.includes(ACTIONS[action]);
+  return robot.actions.includes(ACTIONS[action]) || (action === "set_control" && robot.controls === null);
 }
 
 /** Joints without a position in the first keyframe: the robot starts them from their current position. */

@@ -94,6 +94,10 @@ function parseAction(kind: ActionKind, value: unknown): KeyframeActions[ActionKi
       const { x_m, y_m, yaw_rad } = object(value, "x_m", "y_m", "yaw_rad");
       return { x_m: number(x_m), y_m: number(y_m), ...(yaw_rad === undefined ? {} : { yaw_rad: number(yaw_rad) }) };
     }
+    case "set_control": {
+      const { name, value: target } = object(value, "name", "value");
+      return { name: text(name), value: number(target) };
+    }
     case "posture":
     case "behaviour":
     case "express":

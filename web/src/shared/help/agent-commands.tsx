@@ -1,6 +1,6 @@
 /** List items with the commands that create and run an agent. */
 import { texts } from "./texts";
-import { CopyOnce } from "../../shared/ui/copy-once";
+import { CopyOnce } from "../ui/copy-once";
 import "./help.css";
 
 interface AgentCommandsProps {

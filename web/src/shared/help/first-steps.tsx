@@ -1,7 +1,7 @@
 /** Shown to an account without devices: create an agent, run it and pair it, also with a simulated robot. */
-import { Card } from "../../shared/ui/card";
+import { Card } from "../ui/card";
 import { texts } from "./texts";
-import { robotTypesAddress } from "../../shared/routing/routes";
+import { robotTypesAddress } from "../routing/routes";
 import { AgentCommands } from "./agent-commands";
 import { PageExplainer } from "./page-explainer";
 
