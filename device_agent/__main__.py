@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from device_agent.cli import cameras, devices, doctor, enroll, load_test, models, new_driver, run
+from device_agent.cli import cameras, devices, doctor, enroll, export, load_test, models, new_driver, run, trials
 from device_agent.cli.releases import commands as releases
 from device_agent.config.errors import ConfigError
 from device_agent.config.release import VERSION
@@ -19,10 +19,11 @@ from device_agent.runtime.storage.journal import JournalError
 from device_agent.transports.http.client import CloudError
 
 _ERRORS = (
-    ConfigError, JournalError, DriverError, GeometryError, TransportError, CloudError, LoadTestError, OSError,
+    ConfigError, JournalError, DriverError, GeometryError, TransportError, CloudError, LoadTestError,
+    export.ExportError, OSError,
 )  # fmt: skip
 """Errors that are shown in one line."""
-_COMMANDS = (enroll, run, doctor, devices, cameras, releases, models, new_driver, load_test)
+_COMMANDS = (enroll, run, doctor, devices, cameras, releases, models, new_driver, load_test, export, trials)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

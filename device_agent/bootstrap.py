@@ -10,7 +10,7 @@ import msgspec
 
 from device_agent import drivers, geometry, sensors
 from device_agent.config.agent_config import AgentConfig, DeviceEntry
-from device_agent.config.catalogue import ROOMS, TYPES, enrolled_devices, room_device_of, type_of
+from device_agent.config.catalogue import ROOMS, TYPES, enrolled_devices, room_device_of, tasks_of, type_of
 from device_agent.config.client_certificate import ClientCertificate
 from device_agent.config.errors import ConfigError
 from device_agent.config.identity_store import IdentityStore, Pairing
@@ -26,11 +26,15 @@ from device_agent.ports.uploads import Uploads
 from device_agent.protocol import topics
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.manifests.shipped import ROBOTS
+from device_agent.runtime.actions.task_monitors import TaskMonitors
 from device_agent.runtime.agent import Agent
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.device import Device
 from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.readings import ReadingCache
+from device_agent.runtime.recording import camera_recorder
+from device_agent.runtime.recording import recorder as recording
+from device_agent.runtime.recording.recorder import Recorder
 from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.runtime.storage.journal import Journal
 from device_agent.runtime.storage.outbox_store import OutboxStore
@@ -42,6 +46,7 @@ from device_agent.speech import Espeak
 from device_agent.transports import factory
 from device_agent.transports.http.client import CloudClient
 from device_agent.transports.http.latency_reports import LatencyReports
+from device_agent.transports.http.recording_uploads import HttpRecordingUploads
 from device_agent.transports.http.uploads import HttpUploads
 from device_agent.transports.pairing_monitor import PairingMonitor
 
@@ -58,6 +63,7 @@ class RunningAgent:
     _monitor: PairingMonitor
     _sandbox: Sandbox
     supervisor: Supervisor
+    _recorder: Recorder | None
 
     @property
     def outdated(self) -> bool:
@@ -72,30 +78,21 @@ class RunningAgent:
             TransportError: The configuration of the transport is unusable.
         """
         self._sandbox.start()
+        if self._recorder is not None:
+            self._recorder.start()
         self.agent.start()
         self.supervisor.start()
 
     def stop(self) -> None:
         """Hold, disconnect and close. May be called repeatedly."""
         self.supervisor.stop()
+        if self._recorder is not None:
+            self._recorder.stop_cameras()
         self.agent.stop()
+        if self._recorder is not None:
+            self._recorder.stop()
         self._sandbox.close()
         self._journal.close()
-
-
-def check_robot_type(folder: Path) -> None:
-    """Load a robot type and connect its simulated driver once.
-
-    Raises:
-        ConfigError: The manifest is wrong.
-        GeometryError: The model cannot be used, or the home position collides.
-        DriverError: The driver rejects the robot type.
-    """
-    kind = TYPES.load_from(folder)
-    geometry.load(kind, folder)
-    driver = drivers.load("mujoco")(kind, folder, {}, kind.type)
-    driver.connect()
-    driver.close()
 
 
 def _folder(kind: RobotType) -> Path:
@@ -195,18 +192,6 @@ def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundin
         raise ConfigError(str(error)) from error
 
 
-def renderer_name(configuration: AgentConfig) -> str:
-    """Name of the library that renders simulated cameras, or why there is none; empty without simulated devices."""
-    if not simulates(configuration):
-        return ""
-    from device_agent.simulation import offscreen  # noqa: PLC0415 (real devices need no simulation)
-
-    try:
-        return offscreen.select().name
-    except SensorError as error:
-        return f"none: {error}"
-
-
 def simulates(configuration: AgentConfig) -> bool:
     """Whether MuJoCo simulates a device of this agent."""
     return any(_driver_of(entry) == "mujoco" for entry in configuration.devices)
@@ -287,6 +272,16 @@ def build(
     outbox = _outbox(store, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
     sandbox = SandboxHost(allow_unconfined=configuration.allow_unconfined_scripts)
     uploads = HttpUploads(pairing.agent, lambda: cloud_client(store, configuration, clock))
+    room_devices: dict[str, RoomDevice] = {}
+    recorder = recording.create(
+        configuration.recording,
+        store.recordings,
+        owner=f"{pairing.space}/{pairing.owner}",
+        uploads=HttpRecordingUploads(pairing.agent, lambda: cloud_client(store, configuration, clock)),
+        outbox=outbox,
+        readings=readings,
+        cameras=camera_recorder.create(configuration, journal, pairing, room_devices),
+    )
     load = LoadGovernor() if metrics is None else metrics.load
     supervisor = Supervisor()
     devices: dict[str, Device] = {}
@@ -294,7 +289,7 @@ def build(
     for entry in configuration.devices:
         room_device = create_room_device(entry, neighbours, uploads, home=store.folder, faults=store.faults)
         if room_device is not None:
-            neighbours[entry.name] = room_device.driver
+            neighbours[entry.name], room_devices[entry.name] = room_device.driver, room_device
         devices[entry.name] = _device(
             entry,
             pairing,
@@ -314,11 +309,12 @@ def build(
             supervisor=supervisor,
             traces=traces,
             streaming=configuration.transport != "http",
+            recorder=recorder,
         )
     if metrics is not None:
         metrics.read_from(devices, outbox)
     agent = Agent(devices, transport, outbox=outbox, readings=readings, address=(pairing.space, pairing.agent))
-    return RunningAgent(agent, journal, monitor, sandbox, supervisor)
+    return RunningAgent(agent, journal, monitor, sandbox, supervisor, recorder)
 
 
 def _own_streams(configuration: AgentConfig) -> Iterator[tuple[str, str]]:
@@ -369,8 +365,10 @@ def _device(
     supervisor: Supervisor,
     traces: CommandTraces | None,
     streaming: bool,
+    recorder: Recorder | None,
 ) -> Device:
     kind = type_of(entry)
+    driver = create_driver(entry, kind, trace=trace, faults=faults) if room_device is None else room_device
     return Device(
         name=entry.name,
         label=entry.label or kind.label,
@@ -378,7 +376,7 @@ def _device(
         agent=pairing.agent,
         robot_type=kind,
         obstacle_map=obstacle_map,
-        driver=create_driver(entry, kind, trace=trace, faults=faults) if room_device is None else room_device,
+        driver=driver,
         journal=journal,
         cloud_clock=clock,
         keys=pins,
@@ -395,4 +393,6 @@ def _device(
         supervisor=supervisor,
         traces=traces,
         streaming=streaming,
+        recorder=recorder,
+        task_monitors=None if isinstance(driver, RoomDevice) else TaskMonitors(tasks_of(kind), driver, readings),
     )

@@ -10,14 +10,14 @@ from device_agent.cli.arguments import Commands
 from device_agent.config.agent_config import DeviceEntry
 from device_agent.config.errors import ConfigError
 from device_agent.ports.sensor import SensorError
-from device_agent.protocol import Stream
+from device_agent.protocol import CameraStream
 from device_agent.protocol.manifests.room import Watch
 from device_agent.sensors.camera.options import Credentials, secret_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from device_agent.sensors.camera.onvif.client import Stream as CameraStream
+    from device_agent.sensors.camera.onvif.client import Stream as OnvifStream
     from device_agent.sensors.camera.onvif.discovery import FoundCamera
 
 _PREFERRED_WIDTH = 640
@@ -121,7 +121,7 @@ def _print_entry(camera: "FoundCamera", credentials: Credentials | None, options
         type="camera",
         driver="rtsp",
         label=camera.name or "Camera",
-        cameras=(Stream(name=_SOURCE, rate_hz=10.0),),
+        cameras=(CameraStream(name=_SOURCE, rate_hz=10.0),),
         captures=("image",),
         watch=(Watch(source=_SOURCE, silent_s=10.0, stuck_s=60.0),),  # noise makes all images different
         options={"url": chosen.url, **login},
@@ -129,7 +129,7 @@ def _print_entry(camera: "FoundCamera", credentials: Credentials | None, options
     print("\n" + "\n".join(entry.lines()))
 
 
-def _choose(streams: "Sequence[CameraStream]") -> "CameraStream":
+def _choose(streams: "Sequence[OnvifStream]") -> "OnvifStream":
     """The smallest stream that is wide enough, or else the largest."""
     wide = [stream for stream in streams if stream.profile.width >= _PREFERRED_WIDTH]
     if wide:

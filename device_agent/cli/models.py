@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from device_agent import bootstrap
+from device_agent import drivers, geometry
 from device_agent.cli.arguments import Commands
 from device_agent.config import catalogue
 from device_agent.config.errors import ConfigError
@@ -36,9 +36,24 @@ def _import_model(options: argparse.Namespace) -> int:
         raise ConfigError(str(error)) from error
     print(f"created {folder.resolve()}; check the values that its robot.toml marks as guessed")
     try:
-        bootstrap.check_robot_type(folder)
+        _check_robot_type(folder)
     except (ConfigError, DriverError, GeometryError) as error:
         print(f"the robot type does not run yet: {error}", file=sys.stderr)
         return 1
     print(f"the robot type runs; add {folder.resolve().parent} to {catalogue.ROBOTS_PATH} to use it")
     return 0
+
+
+def _check_robot_type(folder: Path) -> None:
+    """Load a robot type and connect its simulated driver once.
+
+    Raises:
+        ConfigError: The manifest is wrong.
+        GeometryError: The model cannot be used, or the home position collides.
+        DriverError: The driver rejects the robot type.
+    """
+    kind = catalogue.TYPES.load_from(folder)
+    geometry.load(kind, folder)
+    driver = drivers.load("mujoco")(kind, folder, {}, kind.type)
+    driver.connect()
+    driver.close()

@@ -24,6 +24,7 @@ from device_agent.config.errors import ConfigError
 from device_agent.config.identity_store import IdentityStore
 from device_agent.config.release import VERSION
 from device_agent.ports.clock import CloudClock
+from device_agent.ports.sensor import SensorError
 from device_agent.ports.tracing import CommandTraces, NoTraces
 from device_agent.runtime.restart_permission import RestartPermission
 from device_agent.runtime.supervision import CHECK_PERIOD_S
@@ -163,7 +164,7 @@ def _run_until_unpaired(
         on_trial = trial is not None and not trial.over
         if on_trial:
             agent.agent.suspend(SUSPENDED)
-        if renderer := bootstrap.renderer_name(AgentConfig.load(store.folder)):
+        if renderer := _renderer_name(AgentConfig.load(store.folder)):
             print(f"renderer {renderer}", flush=True)
         agent.start()
         _prioritize_control_loops()
@@ -225,3 +226,15 @@ def _prioritize_control_loops() -> None:
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()
+
+
+def _renderer_name(configuration: AgentConfig) -> str:
+    """Name of the library that renders simulated cameras, or why there is none; empty without simulated devices."""
+    if not bootstrap.simulates(configuration):
+        return ""
+    from device_agent.simulation import offscreen  # noqa: PLC0415 (real devices need no simulation)
+
+    try:
+        return offscreen.select().name
+    except SensorError as error:
+        return f"none: {error}"

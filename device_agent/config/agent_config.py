@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from device_agent.config import private_file
 from device_agent.config.errors import ConfigError
 from device_agent.config.interlock_rule import InterlockRule
-from device_agent.protocol import Id, Label, Stream, Vector3
+from device_agent.protocol import CameraStream, Id, Label, Stream, Vector3
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import room as rooms
 from device_agent.protocol.manifests.robot_type import Diagnostic
@@ -46,7 +46,7 @@ class DeviceEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     options: dict[str, Any] = {}
     interlocks: Annotated[tuple[InterlockRule, ...], Meta(max_length=32)] = ()
     streams: Annotated[tuple[Stream, ...], Meta(max_length=16)] = ()
-    cameras: Annotated[tuple[Stream, ...], Meta(max_length=4)] = ()
+    cameras: Annotated[tuple[CameraStream, ...], Meta(max_length=4)] = ()
     captures: Annotated[tuple[Id, ...], Meta(max_length=16)] = ()
     controls: Annotated[tuple[Control, ...], Meta(max_length=16)] = ()
     diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=32)] = ()
@@ -128,6 +128,45 @@ class Buffer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     measurements_hz: Annotated[float, Meta(ge=0.01, le=20)] = 1
 
 
+class Indicator(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``[recording.indicator]`` of ``agent.toml``: a control that shows people in the room that cameras are recorded.
+
+    Attributes:
+        device: Room device of this agent, for example a lamp.
+        control: Its control, which must not move anything.
+        on: Value while cameras are recorded.
+        off: Value otherwise.
+    """
+
+    device: Id
+    control: Id
+    on: float = 1.0
+    off: float = 0.0
+
+
+class Recording(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``[recording]`` of ``agent.toml``: recordings of sessions on the agent's disk.
+
+    Attributes:
+        enabled: Record the sessions of robots.
+        max_gb: Maximum size of all recordings [GB]. Uploaded ones are deleted first, then the oldest.
+        max_age_days: Recordings are deleted after this time [days].
+        min_free_gb: Free space of the disk below which nothing is recorded [GB].
+        upload: Upload recordings to the cloud.
+        camera_rate_hz: Maximum rate of recorded frames of each camera [Hz]. Cameras are recorded only with the owner's
+            consent.
+        indicator: Shows people in the room that cameras are recorded; if it fails, they are not recorded.
+    """
+
+    enabled: bool = True
+    max_gb: Annotated[float, Meta(gt=0, le=100_000)] = 20
+    max_age_days: Annotated[float, Meta(gt=0, le=3650)] = 30
+    min_free_gb: Annotated[float, Meta(ge=0, le=100_000)] = 1
+    upload: bool = True
+    camera_rate_hz: Annotated[float, Meta(ge=0.1, le=30)] = 10
+    indicator: Indicator | None = None
+
+
 class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The content of ``agent.toml``.
 
@@ -140,6 +179,7 @@ class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         http: Polling of the ``http`` transport.
         allow_unconfined_scripts: Run movement scripts even if this machine cannot confine them. Only set by hand.
         buffer: Disk buffer.
+        recording: Recordings of sessions.
         room: Streams of the space that movement scripts may read.
     """
 
@@ -151,6 +191,7 @@ class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     http: HttpPolling = HttpPolling()
     allow_unconfined_scripts: bool = False
     buffer: Buffer = Buffer()
+    recording: Recording = Recording()
     room: Annotated[tuple[RoomStream, ...], Meta(max_length=64)] = ()
 
     @property
@@ -190,6 +231,8 @@ class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             lines += ["", "[http]", *_table(self.http)]
         if self.buffer != Buffer():
             lines += ["", "[buffer]", *_table(self.buffer)]
+        if self.recording != Recording():
+            lines += ["", "[recording]", *_table(self.recording)]
         for stream in self.room:
             lines += ["", "[[room]]", *_table(stream)]
         for device in self.devices:
@@ -207,6 +250,7 @@ class AgentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             devices=tuple(devices),
             room=previous.room,
             buffer=previous.buffer,
+            recording=previous.recording,
             allow_unconfined_scripts=previous.allow_unconfined_scripts,
         )
 

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 from device_agent.config.agent_config import AgentConfig, DeviceEntry
 from device_agent.config.errors import ConfigError
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.manifests import robot_type, room
+from device_agent.protocol.manifests import robot_type, room, tasks
 from device_agent.protocol.manifests.shipped import ROBOTS
 
 ROBOTS_PATH = "TELESCOPE_ROBOTS_PATH"
@@ -115,6 +115,19 @@ def type_of(entry: DeviceEntry) -> robot_type.RobotType:
     if kind.type != entry.type:
         raise ConfigError(f"'{entry.name}' of room '{entry.room}' is a {kind.type}, not a {entry.type}")
     return kind
+
+
+def tasks_of(kind: robot_type.RobotType) -> tasks.Tasks | None:
+    """Tasks of a robot type; ``None``: its folder has no manifest of tasks.
+
+    Raises:
+        ConfigError: The manifest is wrong.
+    """
+    folder = TYPES.folders().get(kind.type)
+    try:
+        return None if folder is None else tasks.load(folder / kind.scene)
+    except ProtocolError as error:
+        raise ConfigError(str(error)) from error
 
 
 def room_device_of(entry: DeviceEntry) -> room.RoomDeviceManifest | None:

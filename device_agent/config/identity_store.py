@@ -8,6 +8,7 @@ pairing.json     space, account and pinned keys; written before a new key is tru
 device.crt/.key  client certificate: ``client_certificate``
 journal.db       commands, epochs and the Stop latch
 outbox.db        messages that are not sent yet
+recordings/      recordings of sessions: ``runtime.recording.folder``
 running.lock     held by the running agent: two agents must not move one robot
 ```
 """
@@ -74,6 +75,7 @@ class IdentityStore:
         self.journal = folder / "journal.db"
         self.outbox = folder / "outbox.db"
         self.faults = folder / "faults"
+        self.recordings = folder / "recordings"
         self.robot_types = folder / "robot_types"
         self._pairing = folder / "pairing.json"
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from device_agent.protocol import RobotTask, codec
+from device_agent.protocol import RobotTask, SetControl, codec
 from device_agent.protocol.commands import Speed
 
 MAX_LINE = 65_536
@@ -84,7 +84,13 @@ class GetLatest(_Message, frozen=True, kw_only=True, tag="latest"):
     stream: _Name
 
 
-Call = RobotTask | Play | Home | GetState | GetLatest
+class Wait(_Message, frozen=True, kw_only=True, tag="wait"):
+    """``wait``, where simulated time passes only on request; elsewhere the process waits by itself."""
+
+    duration_s: Annotated[float, Meta(ge=0, le=3600)]
+
+
+Call = RobotTask | SetControl | Play | Home | GetState | GetLatest | Wait
 """Messages to which the agent responds. ``RobotTask`` is shared with the commands of the wire contract."""
 Message = Ready | Unfit | Output | Progress | Ended | Call
 

@@ -1,27 +1,41 @@
 """Port: driver of one room device, a sensor or a settable device. The implementer's manual.
 
-A room device has streams (named values), cameras (frames), captures (raw data for the blob store) and controls
-(settable values). A driver raises ``SensorError`` with the known names if a name is unknown.
+A room device has streams (named values), cameras (frames of several kinds), captures (raw data for the blob store) and
+controls (settable values). A driver raises ``SensorError`` with the known names if a name is unknown.
 ``docs/guides/add-a-sensor.md`` shows an example.
 """
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.simulation import SimulatedWorld
+from device_agent.protocol import LidarScan, Vector3, camera_frames
+from device_agent.protocol.telemetry import MAX_BEAMS
 
 Floats = npt.NDArray[np.float64]
 Depths = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 Values = Mapping[str, float | bool]
 """Quantity with its unit → value, as ``Measurements`` carries them: ``temperature_c``, ``present``."""
+
+
+def rounded(position_m: Floats) -> Vector3:
+    """A position for messages, in steps of 0.1 mm."""
+    x, y, z = (round(value, 4) for value in position_m.tolist())
+    return x, y, z
+
+
+def rounded_rows(rotation: Floats) -> tuple[Vector3, Vector3, Vector3]:
+    """A rotation matrix of the shape (3, 3) for messages, row by row."""
+    first, second, third = ((round(x, 6), round(y, 6), round(z, 6)) for x, y, z in rotation.tolist())
+    return first, second, third
 
 
 class SensorError(Exception):
@@ -43,19 +57,21 @@ class Capture:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One camera frame.
+    """One frame for viewers; ``protocol.camera_frames`` describes the kinds and their contents.
 
     Attributes:
-        width: Width [pixels].
-        height: Height [pixels].
-        content: The JPEG.
-        taken_s: Time of exposure on ``time.monotonic()`` [s].
+        width: Width: pixels, or the number of beams or people.
+        height: Height [pixels]; 1 for other kinds than pictures.
+        content: The content, for example a JPEG.
+        taken_s: Time of the measurement on ``time.monotonic()`` [s].
+        kind: Kind of the frame, as the manifest declares it for this camera.
     """
 
     width: int
     height: int
     content: bytes
     taken_s: float
+    kind: str = camera_frames.COLOUR
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,16 +98,25 @@ class Scan:
 
     def capture(self) -> Capture:
         """The scan as a JSON file with the present time; ``null`` for a beam without an echo."""
-        content = {
-            "at_ms": wall_ms(),
-            "position_m": [round(value, 4) for value in self.position_m.tolist()],
-            "rotation": [[round(value, 6) for value in row] for row in self.rotation.tolist()],
-            "angle_rad": [round(value, 6) for value in self.angle_rad.tolist()],
-            "range_m": [round(value, 4) if math.isfinite(value) else None for value in self.range_m.tolist()],
-            "nearest_m": self.nearest_m,
-            "furthest_m": self.furthest_m,
-        }
-        return Capture("application/json", json.dumps(content).encode())
+        content = {"at_ms": wall_ms(), **msgspec.structs.asdict(self._message(every=1))}
+        return Capture("application/json", msgspec.json.encode(content))
+
+    def frame(self) -> Frame:
+        """The scan for viewers. A scan with too many beams is reduced by a whole factor."""
+        message = self._message(every=max(1, math.ceil(len(self.range_m) / MAX_BEAMS)))
+        return Frame(len(message.range_m), 1, msgspec.json.encode(message), self.taken_s, camera_frames.SCAN)
+
+    def _message(self, *, every: int) -> LidarScan:
+        return LidarScan(
+            position_m=rounded(self.position_m),
+            rotation=rounded_rows(self.rotation),
+            angle_rad=tuple(round(value, 6) for value in self.angle_rad[::every].tolist()),
+            range_m=tuple(
+                round(value, 4) if math.isfinite(value) else None for value in self.range_m[::every].tolist()
+            ),
+            nearest_m=self.nearest_m,
+            furthest_m=self.furthest_m,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -181,10 +206,10 @@ class RoomDriver(Protocol):
 
 @runtime_checkable
 class Camera(RoomDriver, Protocol):
-    """A room driver with camera streams for viewers, in addition to ``raw``."""
+    """A room driver with streams of frames for viewers, in addition to ``raw``."""
 
     def frame(self, camera: str) -> Frame | None:
-        """A frame taken now, or ``None`` if there is none.
+        """A frame taken now, of the kind that the manifest declares, or ``None`` if there is none.
 
         Raises:
             SensorError: The camera is unknown or failed.

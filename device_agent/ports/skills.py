@@ -1,4 +1,6 @@
-"""Port: skills of a driver other than moving joints and base, and the robot's own behaviours. The implementer's manual.
+"""Port: skills of a driver other than moving joints and base, the robot's own behaviours, and monitors of tasks.
+
+This is the implementer's manual.
 
 Most skills need no driver: the manifest contains expressions, postures, behaviours and mouth shapes, and the runtime
 moves the joints. A driver with ``perform`` takes precedence for capabilities that both its ``performs`` and its robot
@@ -10,7 +12,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from device_agent.protocol import Control, Express, LookAt, RunBehaviour, Say, SetStiffness, TakePosture
+from device_agent.protocol import Control, Express, LookAt, RunBehaviour, Say, SetStiffness, TakePosture, TrialCause
+from device_agent.protocol.manifests.tasks import Tasks
 
 
 class SkillError(Exception):
@@ -116,4 +119,50 @@ class HasControls(Protocol):
 
         Raises:
             SkillError: The robot does not confirm it.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class TaskState:
+    """What a monitor has observed until now.
+
+    Attributes:
+        time_s: Time on the monitor's clock [s]; simulated time in a simulation.
+        met: Whether the condition of the task has been met for the required time until now.
+        failure: Cause of the failure if the trial ended now without success.
+        detail: That cause in words.
+    """
+
+    time_s: float
+    met: bool
+    failure: TrialCause
+    detail: str
+
+
+class TaskMonitor(Protocol):
+    """Observes one task during a trial. Neither the movement nor an operator can change what it reports."""
+
+    def restart(self) -> None:
+        """Observe a new trial from now on."""
+
+    def state(self) -> TaskState:
+        """The newest observation.
+
+        Raises:
+            DriverError: The task is no longer observed.
+        """
+
+    def close(self) -> None:
+        """End the observation."""
+
+
+@runtime_checkable
+class ObservesTasks(Protocol):
+    """A driver that observes tasks whose condition is a state of the simulation."""
+
+    def observe_task(self, manifest: Tasks, task: str) -> TaskMonitor:
+        """Start to observe a task of a manifest.
+
+        Raises:
+            DriverError: The robot is not in a scene with the objects of the task.
         """

@@ -9,10 +9,11 @@ from typing import Any
 
 import msgspec
 
-from device_agent.protocol.acks import Ack, AckStatus, Reason, Stored
+from device_agent.protocol.acks import Ack, AckStatus, Reason, Stored, TrialCause, TrialReport, Verdict
 from device_agent.protocol.commands import (
     KINDS,
     LANGUAGE_PATTERN,
+    MAX_SEED,
     SHIPPED,
     CancelAction,
     CaptureRaw,
@@ -37,7 +38,9 @@ from device_agent.protocol.commands import (
     RotateKey,
     RunBehaviour,
     RunMovement,
+    RunTrial,
     Say,
+    SetCameraConsent,
     SetControl,
     Setpoint,
     SetStiffness,
@@ -51,6 +54,7 @@ from device_agent.protocol.commands import (
 from device_agent.protocol.description import (
     BaseLimits,
     Body,
+    CameraStream,
     Control,
     Description,
     Diagnostic,
@@ -65,6 +69,7 @@ from device_agent.protocol.events import Event
 from device_agent.protocol.fields import FIELD_PATTERN, MAX_VALUES, Field, Id, Label, Pose, Quaternion, Text, Vector3
 from device_agent.protocol.state import (
     ActionState,
+    CameraConsent,
     Capabilities,
     Fault,
     LeaseState,
@@ -75,25 +80,35 @@ from device_agent.protocol.state import (
     State,
     StopLatch,
 )
-from device_agent.protocol.telemetry import JointTelemetry, Measurements
+from device_agent.protocol.telemetry import (
+    BodyJoint,
+    JointTelemetry,
+    LidarScan,
+    Measurements,
+    TrackedPeople,
+    TrackedPerson,
+)
 from device_agent.protocol.versions import PROTOCOL, VersionRange, common_version, incompatibility
 
 __all__ = [
-    "FIELD_PATTERN", "KINDS", "LANGUAGE_PATTERN", "MAX_VALUES", "PROTOCOL", "SHIPPED", "Ack", "AckStatus",
-    "ActionState", "BaseLimits", "Body", "CancelAction", "Capabilities", "CaptureRaw", "CollectData", "Command",
-    "Control", "Description", "Diagnostic", "Drive", "DriveTarget", "Event", "Express", "Fault", "Field", "Geometry",
-    "GoTo", "GrantLease", "Id", "InterlockDescription", "JogTarget", "Joint", "JointTarget", "JointTelemetry", "Label",
-    "LeaseState", "LookAt", "Measurements", "Mode", "MoveJoints", "MovePose", "OpenRequest", "Pose", "Presence",
+    "FIELD_PATTERN", "KINDS", "LANGUAGE_PATTERN", "MAX_SEED", "MAX_VALUES", "PROTOCOL", "SHIPPED", "Ack",
+    "AckStatus", "ActionState", "BaseLimits", "Body", "BodyJoint", "CameraConsent", "CameraStream", "CancelAction",
+    "Capabilities", "CaptureRaw", "CollectData", "Command", "Control", "Description", "Diagnostic", "Drive",
+    "DriveTarget", "Event", "Express", "Fault", "Field", "Geometry", "GoTo", "GrantLease", "Id",
+    "InterlockDescription", "JogTarget", "Joint", "JointTarget", "JointTelemetry", "Label", "LeaseState",
+    "LidarScan", "LookAt", "Measurements", "Mode", "MoveJoints", "MovePose", "OpenRequest", "Pose", "Presence",
     "Quaternion", "Reason", "ReleaseLease", "Request", "RequestControl", "ResetStop", "Restriction", "RobotTask",
-    "RoomTask", "RotateKey", "RunBehaviour", "RunMovement", "Say", "SetControl", "SetStiffness", "Setpoint", "State",
-    "Stop", "StopDevice", "StopLatch", "Stored", "Stream", "TakePicture", "TakePosture", "Task", "Text", "Twin",
-    "TwinJoint", "Vector3", "VersionRange", "WithdrawRequest", "common_version", "incompatibility", "schema_components",
+    "RoomTask", "RotateKey", "RunBehaviour", "RunMovement", "RunTrial", "Say", "SetCameraConsent", "SetControl",
+    "SetStiffness", "Setpoint", "State", "Stop", "StopDevice", "StopLatch", "Stored", "Stream", "TakePicture",
+    "TakePosture", "Task", "Text", "TrackedPeople", "TrackedPerson", "TrialCause", "TrialReport", "Twin",
+    "TwinJoint", "Vector3", "Verdict", "VersionRange", "WithdrawRequest", "common_version", "incompatibility",
+    "schema_components",
 ]  # fmt: skip
 
 
 def schema_components() -> tuple[dict[str, Any], dict[str, Any]]:
     """JSON Schema of every message: references by name, and definitions."""
-    reports = (Presence, Description, Twin, State, JointTelemetry, Measurements, Event, Ack)
+    reports = (Presence, Description, Twin, State, JointTelemetry, Measurements, LidarScan, TrackedPeople, Event, Ack)
     kinds = (*reports, Stored, Command, Setpoint, Stop)
     references, definitions = msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")
     return dict(zip((kind.__name__ for kind in kinds), references, strict=True)), definitions

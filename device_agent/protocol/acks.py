@@ -61,6 +61,54 @@ class Ack(Struct, frozen=True, kw_only=True):
     traceparent: TraceParent | UnsetType = UNSET
 
 
+class Verdict(StrEnum):
+    """How a trial ended. ``UNKNOWN``: its end was not observed."""
+
+    SUCCESS = "success"
+    FAILED = "failed"
+    UNKNOWN = "unknown"
+
+
+class TrialCause(StrEnum):
+    """Why a trial has no success; ``NONE`` after a success."""
+
+    NONE = ""
+    NOT_MET = "not_met"
+    """The condition of the task was not met at the end."""
+    INCOMPLETE = "incomplete"
+    """The robot has lifted the object or moved the part, but the condition was not met: dropped, held or elsewhere."""
+    TIME_LIMIT = "time_limit"
+    """The time limit of the task passed."""
+    MOVEMENT_FAILED = "movement_failed"
+    """The movement or the device failed."""
+    STOPPED = "stopped"
+    """A person, an interlock or the loss of control ended the trial."""
+    LOST = "lost"
+    """The link, the agent or the monitor ended before the trial; or nothing was reported."""
+    NOT_STARTED = "not_started"
+    """The objects were not reset, so the movement did not run."""
+
+
+class TrialReport(Struct, frozen=True, kw_only=True):
+    """Entry ``trial`` in the result of ``run_trial``: the verdict of the monitor. A script cannot write it.
+
+    Attributes:
+        detail: The cause in words, for operators.
+        duration_s: From the reset to the verdict, on the clock of the monitor [s]; simulated time in a simulation.
+        simulated: Whether the device is simulated.
+        software: Release of the agent.
+        type_version: Version of the robot type at the agent.
+    """
+
+    verdict: Verdict
+    cause: TrialCause = TrialCause.NONE
+    detail: Text = ""
+    duration_s: float = 0.0
+    simulated: bool = False
+    software: Label = ""
+    type_version: Count = 0
+
+
 MessageId = Annotated[str, Meta(pattern="^[0-9a-f]{24}$", description="BLAKE2b of topic + line feed + payload")]
 MAX_IDS = 1000
 """Maximum number of ids in one ``Stored`` message: 27 KB."""

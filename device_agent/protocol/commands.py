@@ -63,6 +63,8 @@ class WithdrawRequest(_Request, frozen=True, kw_only=True, tag="drop_request"):
     request: Id
 
 
+MAX_SEED = 1_000_000
+"""Largest seed of a reset of the objects."""
 SHIPPED = "telescope"
 """Author of movements that ship with Telescope. Not a valid account id: those are longer."""
 
@@ -88,6 +90,22 @@ class RunMovement(_Request, frozen=True, kw_only=True, tag="run_movement"):
     key: Label = ""
     signature: Label = ""
     timeout_ms: Annotated[int, Meta(ge=1, le=86_400_000)] = 600_000
+
+
+class RunTrial(_Request, frozen=True, kw_only=True, tag="run_trial"):
+    """One trial of a task: resets the objects, runs the movement, and reports the verdict of the task's monitor.
+
+    Attributes:
+        name: Task of the manifest ``tasks.toml`` of the robot type.
+        tasks_sha256: Hash of that manifest (hex). The device rejects the trial if its own manifest differs.
+        seed: Seed of the reset of the objects; null: nothing is reset.
+        movement: The movement that attempts the task.
+    """
+
+    name: Id
+    tasks_sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+    seed: Annotated[int, Meta(ge=0, le=MAX_SEED)] | None = None
+    movement: RunMovement
 
 
 Speed = Annotated[float, Meta(gt=0, le=1, description="share of each joint's velocity limit")]
@@ -244,17 +262,33 @@ class RotateKey(_Request, frozen=True, kw_only=True, tag="follow_key"):
     statements: Annotated[tuple[Statement, ...], Meta(min_length=1, max_length=MAX_STATEMENTS)]
 
 
+class SetCameraConsent(_Request, frozen=True, kw_only=True, tag="consent_cameras"):
+    """The owner's decision which cameras of the device may be recorded. It replaces the former decision.
+
+    Attributes:
+        cameras: Names of cameras that may be recorded; empty: none.
+        account: Account id of the owner. The device accepts only the account that claimed it.
+        number: Rises with each decision. The device rejects an older one, so that a copy of it changes nothing.
+    """
+
+    cameras: Annotated[tuple[Id, ...], Meta(max_length=16)]
+    account: Label
+    number: Annotated[int, Meta(ge=1, le=2**53)]
+
+
 Request = (
     GrantLease
     | ReleaseLease
     | RequestControl
     | WithdrawRequest
     | RunMovement
+    | RunTrial
     | Task
     | CancelAction
     | StopDevice
     | ResetStop
     | RotateKey
+    | SetCameraConsent
 )
 KINDS = tuple(sorted(str(kind.__struct_config__.tag) for kind in get_args(Request)))
 """Every kind of request, as agents and servers report them."""

@@ -77,6 +77,17 @@ class Stream(Struct, frozen=True, kw_only=True):
     rate_hz: float
 
 
+class CameraStream(Stream, frozen=True, kw_only=True):
+    """A stream of frames at ``cam/{name}``.
+
+    Attributes:
+        kind: Content of the frames, one of ``camera_frames.KINDS``: ``colour``, ``depth``, ``scan`` or ``people``.
+            Receivers ignore streams of unknown kinds.
+    """
+
+    kind: Label = "colour"
+
+
 class Control(Struct, frozen=True, kw_only=True):
     """A value that can be set, between ``lower`` and ``upper`` [``unit``]."""
 
@@ -156,7 +167,7 @@ class Description(Struct, frozen=True, kw_only=True):
         actions: Kinds of actions that the device accepts. ``postures``, ``expressions`` and ``behaviours`` list the
             names that such actions may use. Empty for older agents.
         robot_behaviours: Those of the ``behaviours`` that the robot itself provides.
-        cameras: Camera streams at ``cam/{name}``.
+        cameras: Streams of frames at ``cam/{name}``, each of one kind.
         captures: Raw data that can be captured.
         controls: Values that can be set.
         limits: Limits that the agent enforces for every command source. ``clearance`` and ``workspace`` are absent if
@@ -185,7 +196,7 @@ class Description(Struct, frozen=True, kw_only=True):
     behaviours: tuple[Label, ...] = ()
     robot_behaviours: Annotated[tuple[RobotBehaviour, ...], Meta(max_length=128)] = ()
     streams: tuple[Stream, ...] = ()
-    cameras: tuple[Stream, ...] = ()
+    cameras: tuple[CameraStream, ...] = ()
     captures: tuple[Label, ...] = ()
     controls: tuple[Control, ...] = ()
     watchdog_ms: Milliseconds = 0

@@ -5,9 +5,9 @@ rejections are reported once, and then every few seconds with their ``count``.
 """
 
 from enum import StrEnum
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from device_agent.protocol.fields import Id, Label, Milliseconds, Text
 
@@ -22,6 +22,25 @@ class Event(Struct, frozen=True, kw_only=True):
     severity: Literal["info", "warning", "error"]
     message: Text
     data: dict[str, Any] = {}
+
+
+MovingTime = Annotated[float, Meta(ge=0, le=1e9)]
+
+
+class Activity(Struct, frozen=True, kw_only=True):
+    """``Event.data`` of ``activity``: sums of one lease.
+
+    Attributes:
+        epoch: Epoch of the lease.
+        operator_s: Time in which setpoints of an operator moved the robot [s].
+        machine_s: All other moving time [s].
+        first_input_s: Time from the grant to the first motion by an operator [s]; ``None``: there was none.
+    """
+
+    epoch: Annotated[int, Meta(ge=0, le=2**53)]
+    operator_s: MovingTime
+    machine_s: MovingTime
+    first_input_s: MovingTime | None = None
 
 
 class EventKind(StrEnum):
@@ -49,6 +68,9 @@ class EventKind(StrEnum):
     """Motion was brought to a hold. ``code``, ``epoch``. After ``watchdog``, a new input resumes."""
     ACTION_LOST = "action-lost"
     """A running action lost control of the device. ``code``, ``epoch``."""
+    ACTIVITY = "activity"
+    """How long the robot moved in a lease until now; see ``Activity``. The cloud stores it with the session of the
+    lease, not among the events."""
     SPEECH_STARTED = "speech-started"
     """The device started to speak. ``text``, ``language``."""
     SCRIPTS_UNAVAILABLE = "scripts-unavailable"
@@ -82,3 +104,20 @@ class EventKind(StrEnum):
     ``events``."""
     BUFFER_FAILED = "buffer-failed"
     """Messages could not be stored on disk. ``code``."""
+    RECORDING_FAILED = "recording-failed"
+    """The session is not recorded from now on. ``epoch``."""
+    RECORDING_RESUMED = "recording-resumed"
+    """The session is recorded again. ``epoch``."""
+    CAMERA_CONSENT_CHANGED = "camera-consent-changed"
+    """The owner has decided which cameras may be recorded. ``cameras``, ``caller``, ``number``."""
+    CAMERAS_RECORDED = "cameras-recorded"
+    """Cameras are being recorded from now on. ``cameras``."""
+    CAMERAS_NOT_RECORDED = "cameras-not-recorded"
+    """No cameras are being recorded any more. ``cameras``: the former ones."""
+    RECORDINGS_DELETED = "recordings-deleted"
+    """Recordings were deleted at the agent before they were uploaded: too old, or beyond the quota. ``segments``."""
+    ACTION_STARTED = "action-started"
+    """An action started. Only recordings of sessions contain it. ``action``, ``task``, ``name``, ``caller``."""
+    ACTION_ENDED = "action-ended"
+    """The action ended. Only recordings of sessions contain it. ``action``, ``task``, ``name``, ``caller``, ``status``,
+    and ``code`` if it did not succeed."""

@@ -115,6 +115,22 @@ class Restriction(Struct, frozen=True, kw_only=True):
     reason: Text
 
 
+class CameraConsent(Struct, frozen=True, kw_only=True):
+    """The owner's decision which cameras of the device may be recorded, as the agent has stored it.
+
+    Attributes:
+        cameras: Names of the cameras that may be recorded; empty: none.
+        by: Name of the account that decided; empty: there was no decision yet.
+        at_ms: When the agent stored the decision.
+        number: Number of the decision.
+    """
+
+    cameras: tuple[Id, ...] = ()
+    by: Label = ""
+    at_ms: Milliseconds = 0
+    number: Count = 0
+
+
 class State(Struct, frozen=True, kw_only=True):
     """``state``: the current condition. Retained; published on change and every 30 s.
 
@@ -126,6 +142,10 @@ class State(Struct, frozen=True, kw_only=True):
         stiffness: Joints that hold with reduced strength: joint name → share of the full strength.
         load: Which work the agent reduces because its machine is overloaded: 0: none; 1: cameras; 2: also perception;
             3: also telemetry. Control is never reduced.
+        recording: Whether the session is being recorded on the agent's disk.
+        recorded_cameras: Cameras that are being recorded now, in a session of this robot or, for a room device, of any
+            robot of its agent: names of own cameras, and ``{device}/{camera}`` of room devices.
+        camera_consent: The owner's consent to record cameras; ``None``: the device has no camera that can be recorded.
         rates_hz: Measured rate of each stream and camera: ``tele/joints``, ``cam/front`` → messages a second [Hz]. The
             configured rates are in ``desc``.
     """
@@ -144,3 +164,6 @@ class State(Struct, frozen=True, kw_only=True):
     stiffness: dict[str, float] = {}
     load: Count = 0
     rates_hz: dict[str, float] = {}
+    recording: bool = False
+    recorded_cameras: Annotated[tuple[Label, ...], Meta(max_length=64)] = ()
+    camera_consent: CameraConsent | None = None

@@ -32,20 +32,24 @@ from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.executor import ActionExecutor
 from device_agent.runtime.actions.script_policy import ScriptPolicy
 from device_agent.runtime.actions.speech_output import SpeechOutput
+from device_agent.runtime.actions.task_monitors import TaskMonitors
 from device_agent.runtime.authority.event_recorder import EventRecord, EventRecorder
 from device_agent.runtime.authority.interlocks import Interlocks
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.commands.command_processor import COMMAND_PROCESSOR, CommandProcessor
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
-from device_agent.runtime.control.control_loop import CONTROL_LOOP, ControlLoop
+from device_agent.runtime.control.command_arbiter import ControlOutput
+from device_agent.runtime.control.control_loop import CONTROL_LOOP, REST_RAD_S, ControlLoop
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.readings import ReadingCache
+from device_agent.runtime.recording.recorder import Recorder, add_device
 from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.runtime.room.sensor_loop import SENSOR_LOOP, SensorLoop
 from device_agent.runtime.storage.journal import Journal, JournalError
 from device_agent.runtime.supervision import Failure, PartFaults, Supervisor
+from device_agent.runtime.telemetry.activity_meter import ActivityMeter
 from device_agent.runtime.telemetry.camera_streamer import CameraStreamer
 from device_agent.runtime.telemetry.device_publisher import DevicePublisher
 from device_agent.runtime.telemetry.outbox import Outbox, Publish
@@ -58,8 +62,6 @@ _REJECTED = {
 }
 _SCRIPTS = {"unavailable": EventKind.SCRIPTS_UNAVAILABLE, "unconfined": EventKind.SCRIPTS_UNCONFINED}
 MAX_REASON = 2000
-_REST_RAD_S = 0.05
-"""A joint that is measured below this speed is at rest; above the noise of encoders [rad/s]."""
 _log = logging.getLogger(__name__)
 
 
@@ -92,14 +94,15 @@ class Device:
         supervisor: Supervisor | None = None,
         traces: CommandTraces | None = None,
         streaming: bool = True,
+        recorder: Recorder | None = None,
+        task_monitors: TaskMonitors | None = None,
     ) -> None:
         self.name = name
         self._sync = journal.sync
         self._load = load or LoadGovernor()
         self._driver = driver
         self._sandbox = sandbox
-        supervisor = supervisor or Supervisor()
-        traces = traces or NoTraces()
+        supervisor, traces = supervisor or Supervisor(), traces or NoTraces()
         supervisor.add(self)
         self._part_faults = PartFaults(supervisor)
         self._readings = readings
@@ -128,6 +131,7 @@ class Device:
             skills=driver if isinstance(driver, Skills) else None,
             behaviours=driver if isinstance(driver, HasBehaviours) else None,
             controls=driver if isinstance(driver, HasControls) else None,
+            task_monitors=task_monitors or TaskMonitors(),
             readings=readings,
             own_readings=self._stream_sampler.latest,
             room_device=room_device,
@@ -141,6 +145,15 @@ class Device:
                 record=self._events.record,
                 on_start=driver.start_speech if isinstance(driver, HasSpeaker) else None,
             ),
+        )
+        self._recording, self._cameras = add_device(
+            recorder,
+            (agent, name),
+            robot_type,
+            driver,
+            newest_epoch=lambda: self._controller.epochs[0],
+            holder=self._holder,
+            record=self._events.record,
         )
         self.publisher = DevicePublisher(
             address=(space, agent, name),
@@ -158,6 +171,7 @@ class Device:
             publish=publish,
             outbox=outbox,
             traces=traces,
+            record_event=self._recording.add_event if self._recording else None,
         )
         self._camera_streamer = CameraStreamer(
             robot_type.cameras,
@@ -166,6 +180,7 @@ class Device:
             publish=self.publisher.publish_frame,
             is_controlled=lambda: self._controller.lease(time.monotonic()) is not None,
             load=self._load,
+            recording=self._cameras,
         )
         self._interlocks = Interlocks(
             interlocks,
@@ -174,6 +189,7 @@ class Device:
             lift=self._controller.lift,
             record=lambda event, code, now_s: self._events.record_rejection(event, code=code, now_s=now_s),
         )
+        self._activity = ActivityMeter(self._events.record)
         self._loop = self._create_loop(driver, robot_type)
         policy = ScriptPolicy(device=name, robot_type=robot_type.type, owner=owner, keys=keys, journal=journal)
         self._executor = ActionExecutor(
@@ -191,6 +207,8 @@ class Device:
             wake=self._wake,
             part_faults=self._part_faults.present,
             device_faults=self._loop.faults,
+            recording=self._recording,
+            cameras=self._cameras,
             load=self._load,
             traces=traces,
         )
@@ -204,6 +222,7 @@ class Device:
                 publish=self._publish,
                 publish_frame=self.publisher.publish_frame,
                 check_interlocks=self._interlocks.update,
+                record_frame=self._cameras.record if self._cameras else None,
             )
         return ControlLoop(
             robot_type,
@@ -212,8 +231,19 @@ class Device:
             name=self.name,
             publish=lambda telemetry: self._publish(topics.JOINTS, telemetry),
             check_interlocks=self._interlocks.update,
+            measure=self._measure,
             load=self._load,
+            record=self._recording.record_period if self._recording else None,
         )
+
+    def _holder(self, epoch: int) -> str:
+        lease = self._controller.lease(time.monotonic())
+        return lease.holder if lease is not None and lease.epoch == epoch else self._executor.caller
+
+    def _measure(self, now_s: float, output: ControlOutput, moving: bool) -> None:
+        # A lease that was granted since this period began has not moved the robot.
+        epoch = output.epoch or self._controller.epochs[0]
+        self._activity.record_period(now_s, epoch=epoch, mode=output.mode, moving=moving)
 
     # ------------------------------------------------------------ start and stop
 
@@ -226,8 +256,7 @@ class Device:
         self._loop.start()
         self._stream_sampler.start()
         self._camera_streamer.start()
-        epoch, _ = self._controller.epochs
-        data = {"epoch": epoch, "stopped": self._controller.latch is not None}
+        data = {"epoch": self._controller.epochs[0], "stopped": self._controller.latch is not None}
         message = "the agent started; all previous leases have ended"
         self._events.record(EventRecord(EventKind.AGENT_STARTED, message, data=data))
         self.publisher.scripts = scripts = self._sandbox.status()
@@ -241,6 +270,7 @@ class Device:
         self._controller.interrupt(Refused("agent_stopping", "the agent was shut down"))
         self._executor.close()
         self._loop.stop()
+        self._activity.report(time.monotonic())
         self._stream_sampler.stop()
         self._camera_streamer.stop()
         self._events.record(EventRecord(EventKind.AGENT_STOPPED, "the agent was shut down"))
@@ -308,11 +338,13 @@ class Device:
         observation = self._loop.observation
         if observation is None or self._controller.fault is not None:
             return False
-        return any(abs(velocity) > _REST_RAD_S for velocity in observation.velocity_rad_s)
+        return any(abs(velocity) > REST_RAD_S for velocity in observation.velocity_rad_s)
 
     def _publish(self, stream: str, telemetry: JointTelemetry | Measurements) -> None:
         self._readings.record(self.name, stream, telemetry)
         self.publisher.publish_telemetry(stream, telemetry)
+        if self._recording is not None and isinstance(telemetry, Measurements):
+            self._recording.add_measurements(stream, telemetry)
 
     # ------------------------------------------------------------ received messages (transport's thread)
 
@@ -340,11 +372,10 @@ class Device:
 
     def _stop(self, author: str, stop: Stop) -> None:
         """Latch Stop. Only the broker vouches for the author, so it is shown as unverified."""
-        caller = unverified(author)
-        reason = printable(stop.reason[:MAX_REASON])
-        self._controller.stop(StopLatch(caller=caller, reason=reason, at_ms=wall_ms()), message=stop.id)
+        latch = StopLatch(caller=unverified(author), reason=printable(stop.reason[:MAX_REASON]), at_ms=wall_ms())
+        self._controller.stop(latch, message=stop.id)
         self._wake()
-        _log.warning("%s: stopped by %s", self.name, caller)
+        _log.warning("%s: stopped by %s", self.name, latch.caller)
 
     def _accept_setpoint(self, topic: topics.Topic, payload: bytes) -> None:
         now_s = time.monotonic()

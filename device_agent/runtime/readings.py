@@ -66,7 +66,12 @@ class ReadingCache:
         self._clock_s = clock_s
         self._lock = threading.Lock()
         self._received: dict[Source, _Received] = {}
+        self._listener: Callable[[str, str, Measurements], None] | None = None
         self.sources = frozenset(self.source(device, stream) for device, stream in named)
+
+    def listen(self, listener: Callable[[str, str, Measurements], None]) -> None:
+        """Call ``listener`` with device id, stream and each new measurement of a source. It must not block."""
+        self._listener = listener
 
     def source(self, device: str, stream: str) -> Source:
         """The source for a device of this agent by its name, or any device by its id."""
@@ -137,6 +142,8 @@ class ReadingCache:
             if before is not None and now_s - before.at_s < RESTART_GAP_S and _is_older(measured, before):
                 return
             self._received[source] = _Received(values, now_s, measured.tick_ms, measured.sequence)
+        if self._listener is not None and isinstance(measured, Measurements):
+            self._listener(source.device, source.stream, measured)
 
 
 def _joint_values(measured: JointTelemetry) -> Values:

@@ -19,7 +19,7 @@ Send = Callable[..., None]
 OLD_S = 5.0
 """Older occupancy measurements are ignored [s]."""
 
-_SKILLS = ("posture", "behaviour", "express", "say", "drive", "go_to")
+_SKILLS = ("posture", "behaviour", "express", "say", "drive", "go_to", "set_control")
 """Skills that a keyframe may contain."""
 
 
@@ -63,8 +63,8 @@ class Robot:
         Args:
             keyframes: Dictionaries in the order of ``time_s``. ``position_rad``: joint name → position [rad]; unnamed
                 joints move on to their next named position. Skills to execute at the keyframe, in this order:
-                ``posture``, ``behaviour``, ``express``, ``say``: a name or text; ``drive``, ``go_to``: their
-                arguments by name. Time pauses during skills.
+                ``posture``, ``behaviour``, ``express``, ``say``: a name or text; ``drive``, ``go_to``,
+                ``set_control``: their arguments by name. Time pauses during skills.
             speed: 1: times as given; 0.5: twice as long. Above 0, up to 2.
         """
         start_s, group = 0.0, []
@@ -173,6 +173,17 @@ class Robot:
         """Run a behaviour of the robot, and wait for its end."""
         self._request("run_behaviour", name=str(name))
 
+    def set_control(self, name: str, value: float) -> float:
+        """Set a control of the robot, such as ``gripper``, and wait; returns the value that the robot has measured.
+
+        A gripper returns a smaller value than the commanded one if its fingers have stopped at an object.
+
+        Args:
+            name: Name of the control, as on the robot's page.
+            value: Value within the limits of the control.
+        """
+        return float(self._request("set_control", control=str(name), value=float(value)))
+
     def state(self) -> dict[str, Any]:
         """Measured ``position_rad``, ``velocity_rad_s``, ``effort_nm`` by joint name, ``frames`` by name, ``mode``.
 
@@ -238,7 +249,10 @@ def namespace(send: Send, request: Request, flush: Callable[[], None], task: Map
     def wait(duration_s: float) -> None:
         """Wait [s]; the robot holds."""
         flush()
-        time.sleep(duration_s)
+        if "wait" in task["can"]:  # simulated time
+            request("wait", duration_s=float(duration_s))
+        else:
+            time.sleep(duration_s)
 
     def progress(share: float) -> None:
         """Report the share of completed work, 0 to 1."""

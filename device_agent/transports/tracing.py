@@ -15,7 +15,7 @@ from opentelemetry.sdk.trace.export import BatchSpanProcessor
 from opentelemetry.trace import Span, SpanKind, Status, StatusCode
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
-from device_agent.protocol import AckStatus, Command, Reason, RunMovement, Task
+from device_agent.protocol import AckStatus, Command, Reason, RunMovement, RunTrial, Task
 from device_agent.protocol.fields import trace_id
 from device_agent.transports.pairing_monitor import SOFTWARE
 
@@ -65,7 +65,7 @@ class OtlpTraces:
             SpanKind.CONSUMER,
             {"telescope.command": command.id, "telescope.device": command.device},
         )
-        first = "accept" if isinstance(command.request, RunMovement | Task) else "apply"
+        first = "accept" if isinstance(command.request, RunMovement | RunTrial | Task) else "apply"
         spans = _CommandSpans(whole, self._child(whole, first))
         with self._lock:
             self._open[command.id] = spans

@@ -18,6 +18,7 @@ from device_agent.protocol import (
     ReleaseLease,
     ResetStop,
     RunMovement,
+    RunTrial,
     State,
     Stop,
     StopDevice,
@@ -47,6 +48,7 @@ class Robot:
     Attributes:
         reports: Returns the acks of a new action. Tests may replace it.
         silent: Send no acks.
+        robot_type: Robot type of its devices, set before the enrollment.
         gate: Rejects outdated epochs, as a device does; ``None``: accepts every epoch.
     """
 
@@ -60,6 +62,7 @@ class Robot:
         self.space = ""
         self.session = 0
         self.silent = False
+        self.robot_type = "ur5"
         self.gate: LeaseGate | None = None
         self.reports: Callable[[Command], Acks] = lambda _: (AckStatus.RECEIVED, AckStatus.ACCEPTED, AckStatus.STARTED)
         self.commands: list[Command] = []
@@ -93,7 +96,8 @@ class Robot:
         return self.cloud.request(method, PREFIX + path, headers=headers, **options)
 
     def introduction(self, **changes: Any) -> dict[str, Any]:
-        devices = [{"name": name, "kind": "arm", "robot_type": "ur5", "label": name.title()} for name in self.names]
+        common = {"kind": "arm", "robot_type": self.robot_type}
+        devices = [{"name": name, **common, "label": name.title()} for name in self.names]
         return {"name": "lab", "public_key": self.public, "software": "simulated 1", "devices": devices, **changes}
 
     def enroll(self, **changes: Any) -> httpx.Response:
@@ -188,7 +192,7 @@ class Robot:
         self.commands.append(command)
         if self.silent or self.link is None:
             return
-        action = isinstance(command.request, Task | RunMovement)
+        action = isinstance(command.request, Task | RunMovement | RunTrial)
         reports: Acks = self.reports(command) if action else (AckStatus.RECEIVED, AckStatus.DONE)
         if action and self.cloud.clock.now_ms() > command.issued_at_ms + command.ttl_ms:
             reports = (AckStatus.EXPIRED,)

@@ -1,6 +1,5 @@
 """Log output of all programs: readable text or JSON lines, rotated files, and a limit for lines that repeat."""
 
-import argparse
 import json
 import logging
 import sys
@@ -9,8 +8,11 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from datetime import UTC, datetime
-from logging.handlers import RotatingFileHandler
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import argparse
 
 FILE_BYTES = 10_000_000
 FILE_COUNT = 5
@@ -31,7 +33,7 @@ context: ContextVar[Callable[[], Mapping[str, str]] | None] = ContextVar("log co
 """Returns ``request``, ``action``, ``device`` and ``trace_id`` of the work; called only if a line is written."""
 
 
-def add_arguments(parser: argparse.ArgumentParser, environment: Mapping[str, str]) -> None:
+def add_arguments(parser: "argparse.ArgumentParser", environment: Mapping[str, str]) -> None:
     """Add ``--log-format`` and ``--log-file``; by default the values of the environment."""
     log_format = environment.get("TELESCOPE_LOG_FORMAT", "text")
     parser.add_argument(
@@ -49,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser, environment: Mapping[str, str
     )
 
 
-def configure(options: argparse.Namespace) -> None:
+def configure(options: "argparse.Namespace") -> None:
     """Set up the root logger from the arguments of ``add_arguments``.
 
     Raises:
@@ -58,10 +60,12 @@ def configure(options: argparse.Namespace) -> None:
     logging.basicConfig(level=logging.INFO, handlers=[create_handler(options), recent])
 
 
-def create_handler(options: argparse.Namespace) -> logging.Handler:
+def create_handler(options: "argparse.Namespace") -> logging.Handler:
     """The output of the log. Raises ``OSError``: the file cannot be written."""
     handler: logging.Handler = logging.StreamHandler(sys.stderr)
     if options.log_file is not None:
+        from logging.handlers import RotatingFileHandler  # noqa: PLC0415 (slow, and not for cloud functions)
+
         handler = RotatingFileHandler(options.log_file, maxBytes=FILE_BYTES, backupCount=FILE_COUNT, encoding="utf-8")
     handler.setFormatter(JsonFormatter() if options.log_format == "json" else TextFormatter())
     handler.addFilter(RateLimit())

@@ -9,14 +9,16 @@ from msgspec import StructMeta
 from device_agent.ports.driver import Observation
 from device_agent.ports.floor_map import ObstacleMap
 from device_agent.ports.geometry import RobotGeometry
-from device_agent.ports.script_calls import GetLatest, GetState, Home, Play
+from device_agent.ports.script_calls import GetLatest, GetState, Home, Play, Wait
 from device_agent.ports.skills import HasBehaviours, HasControls, RobotBehaviour, Skills
 from device_agent.protocol import LookAt, MovePose, RunBehaviour, SetControl, SetStiffness, TakePosture
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.manifests.task_kinds import tag, tasks_of
 from device_agent.runtime.actions.speech_output import SpeechOutput
+from device_agent.runtime.actions.task_monitors import TaskMonitors
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
+from device_agent.runtime.planning.localization import PoseEstimator
 from device_agent.runtime.readings import Reading, ReadingCache
 from device_agent.runtime.room.room_device import RoomDevice
 
@@ -45,7 +47,10 @@ class DeviceContext:
         own_readings: Newest reading of each stream of this device except ``joints``.
         name: Name of the device in the positions that room sensors publish.
         obstacle_map: Newest obstacle map of the room, if sensors publish one. ``go_to`` needs it.
+        pose_estimator: Localization of the device in the room.
         wake: Called after a goal has started; see ``ControlLoop.wake``.
+        stepped: Whether simulated time passes only while the action waits, so that scripts wait by a call.
+        task_monitors: Monitors of the robot type's tasks, for trials.
     """
 
     robot_type: RobotType
@@ -59,9 +64,12 @@ class DeviceContext:
     name: str = ""
     obstacle_map: Callable[[], ObstacleMap | None] | None = None
     speech: SpeechOutput = field(default_factory=SpeechOutput)
+    pose_estimator: PoseEstimator = field(default_factory=PoseEstimator)
     wake: Callable[[], None] = lambda: None
     behaviours: HasBehaviours | None = None
     controls: HasControls | None = None
+    stepped: bool = False
+    task_monitors: TaskMonitors = field(default_factory=TaskMonitors)
 
     def observation(self) -> Observation:
         """The newest observation.
@@ -84,7 +92,7 @@ class DeviceContext:
     def supported(self) -> tuple[StructMeta, ...]:
         """Types of the calls that this robot supports."""
         joint_calls = (Play, Home) if self.robot_type.joints else ()
-        return *self._tasks(), *joint_calls, GetState, GetLatest
+        return *self._tasks(), *self._control_calls(), *joint_calls, GetState, GetLatest, *(Wait,) * self.stepped
 
     def _tasks(self) -> tuple[StructMeta, ...]:
         return tasks_of(
@@ -101,8 +109,10 @@ class DeviceContext:
 
     def tasks(self) -> tuple[str, ...]:
         """Kinds of the wire contract's tasks that this robot supports."""
-        controls = (SetControl,) if self.controls is not None and self.controls.controls else ()
-        return tuple(map(tag, (*self._tasks(), *controls)))
+        return tuple(map(tag, (*self._tasks(), *self._control_calls())))
+
+    def _control_calls(self) -> tuple[StructMeta, ...]:
+        return (SetControl,) if self.controls is not None and self.controls.controls else ()
 
     def robot_behaviours(self) -> tuple[RobotBehaviour, ...]:
         """The robot's own behaviours, as far as they are known now and a description can list them."""

@@ -1,12 +1,14 @@
 """Executes one action at a time on one device, in its own thread, and acknowledges each step."""
 
+import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Protocol
 
+from device_agent.ports.clock import wall_ms
 from device_agent.ports.sandbox import Sandbox
 from device_agent.ports.threads import SupervisedThread
 from device_agent.protocol import (
@@ -17,19 +19,23 @@ from device_agent.protocol import (
     RoomTask,
     RunBehaviour,
     RunMovement,
+    RunTrial,
     SetControl,
     Task,
 )
+from device_agent.protocol.events import EventKind
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.actions.script_action import MAX_OUTPUT, ScriptAction, ScriptFailed, ScriptSandbox
 from device_agent.runtime.actions.script_policy import ScriptPolicy
+from device_agent.runtime.actions.trial_action import TrialAction
+from device_agent.runtime.authority.event_recorder import EventRecord, Severity
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.room import room_actions
 
 Report = Callable[..., None]
-"""``report(command_id, status, reason=…, progress=…, output=…, result=…)``: journal and publish one ack."""
-ActionRequest = RunMovement | Task
+"""``report(command_id, status, recorded=…, reason=…, progress=…, output=…, result=…)``: journal and publish one ack."""
+ActionRequest = RunMovement | RunTrial | Task
 
 _PROGRESS_PERIOD_S = 0.2
 _INTERNAL = Refused("internal", "the agent failed during the action; see the agent's log")
@@ -69,8 +75,12 @@ class ActionExecutor:
                 raise Refused("busy", f"action {self._run.command.id} runs on this device")
             run = _Run(command, self._context, self._report, self._sync)
             if isinstance(request, RunMovement):
-                run.reserve(_TimedScript(request, run, self._check_script(request)))
+                run.reserve(_TimedActivity(_Script(self._script(request, run), run), request, run))
                 self._policy.record_version(request)
+            elif isinstance(request, RunTrial):
+                trial = TrialAction(request, self._script(request.movement, run), run=run, context=self._context)
+                run.reserve(_TimedActivity(trial, request.movement, run))
+                self._policy.record_version(request.movement)
             elif isinstance(request, SetControl) and self._context.controls is not None:
                 set_control = partial(run.robot.skill_runner.set_control, request, self._context.controls)
                 run.reserve(room_actions.OneShotAction(set_control))
@@ -101,6 +111,12 @@ class ActionExecutor:
             return None if self._run is None else self._run.state()
 
     @property
+    def caller(self) -> str:
+        """Name of the account that started the running action; empty if none runs."""
+        run = self._run
+        return "" if run is None else run.command.caller
+
+    @property
     def idle(self) -> bool:
         """Whether no action runs, and the end of the last one is in the journal."""
         last = self._last
@@ -114,14 +130,15 @@ class ActionExecutor:
             run.end(AckStatus.FAILED, Refused("agent_stopping", "the agent was shut down"))
             run.over.wait(timeout=2)
 
-    def _check_script(self, request: RunMovement) -> ScriptSandbox:
+    def _script(self, request: RunMovement, run: "_Run") -> ScriptAction:
         """Check a script, and select the sandbox for it."""
         self._policy.verify(request)
         untrusted = self._policy.is_untrusted(request)
         refusal = self._sandbox.refusal(untrusted=untrusted)
         if refusal is not None:
             raise Refused("no_sandbox", refusal)
-        return ScriptSandbox(self._sandbox, untrusted)
+        sandbox = ScriptSandbox(self._sandbox, untrusted)
+        return ScriptAction(request, run.robot, run.add_output, sandbox=sandbox, on_exit=run.robot.release)
 
     def _execute(self, run: "_Run") -> None:
         try:
@@ -146,16 +163,31 @@ class _Activity(Protocol):
         """End it, from any thread; never blocks. May be called twice."""
 
 
-class _TimedScript:
-    """A script with a time limit."""
+class _Script:
+    """A movement script."""
 
-    def __init__(self, request: RunMovement, run: "_Run", sandbox: ScriptSandbox) -> None:
-        self._script = ScriptAction(request, run.robot, run.add_output, sandbox=sandbox, on_exit=run.robot.release)
-        self._timeout_s = request.timeout_ms / 1000
-        self._robot, self._end = run.robot, run.end
+    def __init__(self, script: ScriptAction, run: "_Run") -> None:
+        self._script = script
+        self._robot = run.robot
 
     def kill(self) -> None:
         self._script.kill()
+
+    def run(self) -> dict[str, Any]:
+        self._script.run()
+        return self._robot.limits()
+
+
+class _TimedActivity:
+    """An activity with the time limit of a movement."""
+
+    def __init__(self, activity: _Activity, movement: RunMovement, run: "_Run") -> None:
+        self._activity = activity
+        self._timeout_s = movement.timeout_ms / 1000
+        self._end = run.end
+
+    def kill(self) -> None:
+        self._activity.kill()
 
     def run(self) -> dict[str, Any]:
         why = Refused("too_long", f"the movement was ended after its {self._timeout_s:g} s")
@@ -163,10 +195,9 @@ class _TimedScript:
         timer.daemon = True
         timer.start()
         try:
-            self._script.run()
+            return self._activity.run()
         finally:
             timer.cancel()
-        return self._robot.limits()
 
 
 class _Run:
@@ -200,7 +231,8 @@ class _Run:
 
     def report_started(self) -> None:
         """Acknowledge the start immediately, while the action's thread starts and syncs the journal."""
-        self._attempt(lambda: self._report(self.command.id, AckStatus.STARTED))
+        event = self._event(EventKind.ACTION_STARTED, "started")
+        self._attempt(lambda: self._report(self.command.id, AckStatus.STARTED, recorded=event))
         self._started.set()
 
     def execute(self) -> None:
@@ -211,7 +243,30 @@ class _Run:
             self._attempt(self._run_activity)
 
     def _run_activity(self) -> None:
-        self._result = self._activity.run()
+        self.add_result(self._activity.run())
+
+    def add_result(self, entries: dict[str, Any]) -> None:
+        """Add entries to the result."""
+        self._result |= entries
+
+    @property
+    def why(self) -> Refused | None:
+        """Why the action was ended; ``None``: it was not."""
+        return None if self._ending is None else self._ending[1]
+
+    @contextlib.contextmanager
+    def reserve_again(self) -> Iterator[None]:
+        """Reserve the device after the script has ended.
+
+        Raises:
+            Refused: The device cannot be reserved.
+        """
+        robot = RobotApi(self._context)
+        robot.reserve(self.command.epoch, self._on_revoked)
+        try:
+            yield
+        finally:
+            robot.release()
 
     def _attempt(self, step: Callable[[], None]) -> None:
         try:
@@ -235,13 +290,24 @@ class _Run:
         try:
             result = self._context.measured() | self._result
             if self._ending is None:
-                self._report(self.command.id, AckStatus.DONE, output=self._output, progress=1.0, result=result)
+                event = self._event(EventKind.ACTION_ENDED, "succeeded", status=AckStatus.DONE)
+                report = partial(self._report, self.command.id, AckStatus.DONE, progress=1.0)
             else:
                 status, why = self._ending
                 reason = Reason(code=why.code, message=why.message[:MAX_OUTPUT])
-                self._report(self.command.id, status, reason=reason, output=self._output, result=result)
+                event = self._event(EventKind.ACTION_ENDED, f"{status}: {why.message}", status=status, code=why.code)
+                report = partial(self._report, self.command.id, status, reason=reason)
+            report(recorded=event, output=self._output, result=result)
         finally:
             self.over.set()
+
+    def _event(self, kind: EventKind, what: str, **data: str) -> EventRecord:
+        """An event of this action for the recording. ``what``: what happened to it."""
+        action, caller = self.state(), self.command.caller
+        message = f"action {action.kind} {action.name}".rstrip() + f" of {caller} {what}"
+        data = {"action": action.id, "task": action.kind, "name": action.name, "caller": caller, **data}
+        severity: Severity = "warning" if "code" in data else "info"
+        return EventRecord(kind, message, severity, data, wall_ms())
 
     def state(self) -> ActionState:
         """The action as the device's ``state`` contains it."""

@@ -6,8 +6,8 @@ from typing import Any
 
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import GeometryError, RobotGeometry
-from device_agent.ports.script_calls import Call, GetLatest, GetState, Home, Play
-from device_agent.protocol import Drive, GoTo, LookAt, MoveJoints, MovePose, RobotTask
+from device_agent.ports.script_calls import Call, GetLatest, GetState, Home, Play, Wait
+from device_agent.protocol import Drive, GoTo, LookAt, MoveJoints, MovePose, RobotTask, SetControl
 from device_agent.protocol.manifests.task_kinds import tag
 from device_agent.runtime.actions.device_context import SCRIPT_NAMES, DeviceContext, by_name
 from device_agent.runtime.actions.skill_runner import SkillRunner
@@ -16,7 +16,7 @@ from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import gaze
 from device_agent.runtime.planning.keyframe_trajectory import MAX_SPEED, KeyframeTrajectory
-from device_agent.runtime.planning.localization import ODOMETRY, POSITIONS, Pose2D, PoseEstimator
+from device_agent.runtime.planning.localization import ODOMETRY, POSITIONS, Pose2D
 from device_agent.runtime.planning.motion_planner import MotionPlanner, quaternion_of
 from device_agent.runtime.planning.navigator import MAX_APPROACHES, SETTLE_UPDATES, UPDATE_PERIOD_S, Navigator
 from device_agent.runtime.readings import Reading
@@ -79,13 +79,23 @@ class RobotApi:
                 self._go_to(call)
             case LookAt():
                 self._look_at(call)
-            case GetState():
-                return self._state()
-            case GetLatest(device=device, stream=stream):
-                return self._latest(device, stream)
+            case SetControl() | Wait() | GetState() | GetLatest():
+                return self._respond(call)
             case _:
                 self.skill_runner.run(call)
         return None
+
+    def _respond(self, call: SetControl | Wait | GetState | GetLatest) -> Any:
+        """Execute a call that moves neither joints nor the base."""
+        match call:
+            case SetControl():
+                robot = self._context.controls
+                return robot and self.skill_runner.set_control(call, robot)["applied"][call.control]
+            case Wait(duration_s=duration_s):
+                return self.ended.wait(duration_s)
+            case GetState():
+                return self._state()
+        return self._latest(call.device, call.stream)
 
     def execute_task(self, task: RobotTask) -> dict[str, Any]:
         """Execute a single task to its end; losing the reservation ends it. Returns ``limits``."""
@@ -159,27 +169,32 @@ class RobotApi:
         """Approach the goal, and repeat it if the pose at rest shows that the robot is not there."""
         context = self._context
         navigator = Navigator.for_robot(call.x_m, call.y_m, call.yaw_rad, context.robot_type)
-        estimator = PoseEstimator(context.name)
+        context.pose_estimator.start(navigator.max_speed_m_s)
         for _ in range(MAX_APPROACHES):
-            self._approach(navigator, estimator)
-            pose = self._measure_at_rest(estimator)
+            self._approach(navigator)
+            pose = self._measure_at_rest()
             if navigator.is_near(pose):
                 return
         navigator.require_arrival(pose)
 
-    def _measure_at_rest(self, estimator: PoseEstimator) -> Pose2D:
-        """The pose after the robot has come to rest: positions from the room arrive late."""
-        for _ in range(SETTLE_UPDATES):
+    def _measure_at_rest(self) -> Pose2D:
+        """The pose after the robot has come to rest: positions from the room arrive late.
+
+        Raises:
+            Refused: The room's sensors contradict the pose, or do not see the robot.
+        """
+        for update in range(1, SETTLE_UPDATES + 1):
             self.wait_for(self._context.controller.start_drive(self.reservation, REST, duration_s=UPDATE_PERIOD_S))
-            pose = self._pose(estimator)
+            pose = self._pose(confirm=update == SETTLE_UPDATES)
         return pose
 
-    def _pose(self, estimator: PoseEstimator) -> Pose2D:
+    def _pose(self, *, confirm: bool = False) -> Pose2D:
         context = self._context
         room = context.readings.newest(POSITIONS, f"x_m.{context.name}")
-        return estimator.estimate(context.own_readings().get(ODOMETRY), room)
+        odometry = context.own_readings().get(ODOMETRY)
+        return context.pose_estimator.estimate(context.name, odometry, room, confirm=confirm)
 
-    def _approach(self, navigator: Navigator, estimator: PoseEstimator) -> None:
+    def _approach(self, navigator: Navigator) -> None:
         """Drive by drives of limited duration: if this loop stops, the robot stops."""
         context, controller = self._context, self._context.controller
         waited_s = 0.0
@@ -187,7 +202,11 @@ class RobotApi:
             obstacle_map = None if context.obstacle_map is None else context.obstacle_map()
             if obstacle_map is None:
                 raise Refused("no_ground", "no sensor reports the obstacles in the room; drive manually")
-            pose = self._pose(estimator)
+            try:
+                pose = self._pose()
+            except Refused:
+                controller.start_drive(self.reservation, REST, duration_s=UPDATE_PERIOD_S)  # ends the last drive
+                raise
             try:
                 twist, waited_s = navigator.compute_twist(pose, obstacle_map), 0.0
             except Refused as refused:

@@ -26,6 +26,7 @@ from device_agent.protocol import (
     ResetStop,
     Restriction,
     RotateKey,
+    SetCameraConsent,
     StopDevice,
     StopLatch,
     Twin,
@@ -45,6 +46,8 @@ from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import INTERNAL_ERROR, Refused
 from device_agent.runtime.load import LoadGovernor
+from device_agent.runtime.recording.camera_recorder import DeviceCameras
+from device_agent.runtime.recording.device_recording import DeviceRecording
 from device_agent.runtime.storage.journal import Journal, JournalError
 from device_agent.runtime.telemetry.device_publisher import DevicePublisher, StateSnapshot
 
@@ -83,6 +86,8 @@ class CommandProcessor:
         load: LoadGovernor,
         traces: CommandTraces,
         device_faults: Callable[[], tuple[Fault, ...]] = tuple,
+        recording: DeviceRecording | None = None,
+        cameras: DeviceCameras | None = None,
         part_faults: Callable[[], tuple[Fault, ...]] = tuple,
     ) -> None:
         self._address = address
@@ -99,6 +104,8 @@ class CommandProcessor:
         self._traces = traces
         self._device_faults = device_faults
         self._part_faults = part_faults
+        self._recording = recording
+        self._cameras = cameras
         self._control_request = PendingControlRequest()
         self._fault_reporter = FaultReporter(stable_s=FAULT_STABLE_S)
         self._pending_stops: dict[str, int] = {}
@@ -291,6 +298,8 @@ class CommandProcessor:
                 self._reset_stop(command)
             case RotateKey(statements=statements):
                 self._keys.follow(statements)
+            case SetCameraConsent() as decision:
+                self._decide_on_cameras(decision, command.caller)
             case CancelAction(action=action):
                 self._executor.cancel(action, command.caller)
             case action:
@@ -301,6 +310,11 @@ class CommandProcessor:
                 return
         self._write_journal()
         self._publisher.report(command.id, AckStatus.DONE)
+
+    def _decide_on_cameras(self, decision: SetCameraConsent, caller: str) -> None:
+        if self._cameras is None:
+            raise Refused("cannot", "the cameras of this device cannot be recorded")
+        self._cameras.decide(decision, caller=caller)
 
     def _confirm_stops(self) -> None:
         """Acknowledge each Stop that the control loop has applied. Without the loop, no Stop is acknowledged."""
@@ -339,6 +353,8 @@ class CommandProcessor:
     def _faults(self) -> tuple[Fault, ...]:
         """Open faults: of threads, those that the device reports, and the driver's error unless it is one of them."""
         error, present = self._controller.fault, self._part_faults() + self._device_faults()
+        for each in (self._recording, self._cameras):
+            present += () if each is None else each.faults()
         if error is not None and not any(error == fault.message for fault in present):
             present += (Fault(code=_DRIVER, message=error[:2000], since_ms=wall_ms()),)
         changes = self._fault_reporter.update(present)
@@ -371,4 +387,7 @@ class CommandProcessor:
             ),
             stiffness=self._controller.reduced_stiffness,
             load=self._load.level,
+            recording=self._recording is not None and self._recording.active,
+            recorded_cameras=() if self._cameras is None else self._cameras.recorded,
+            camera_consent=None if self._cameras is None else self._cameras.consent,
         )

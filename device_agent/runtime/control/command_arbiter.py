@@ -27,7 +27,8 @@ _SAME_TWIST = 1e-3
 class ControlOutput:
     """Output of one period. ``position_rad`` and ``twist`` are motor commands; the rest is for telemetry.
 
-    ``stops``: number of Stops received before this period.
+    ``stops``: number of Stops received before this period. ``requested_rad``: target of the source before limits; empty
+    if it has no target. ``seen_tick_ms``: tick that the setpoint echoes.
     """
 
     position_rad: list[float]
@@ -40,6 +41,8 @@ class ControlOutput:
     twist: Twist = REST
     stops: int = 0
     ended_input: int = 0
+    requested_rad: Sequence[float] = ()
+    seen_tick_ms: int = 0
 
 
 class CommandArbiter:
@@ -74,7 +77,7 @@ class CommandArbiter:
             state.authority.end(Refused("fault", str(error)))
             state.mode = Mode.HOLDING
             state.goals.abort()
-        limited = self._limited()
+        limited, requested_rad = self._limited(), self._requested()
         state.goals.finish(limited, measured_rad=measured_rad, soft=state.stiffness.soft, settled=settled)
         lease = state.authority.lease(now_s)
         return ControlOutput(
@@ -88,6 +91,8 @@ class CommandArbiter:
             state.goals.twist,
             state.stops,
             state.authority.ended_input if lease else 0,
+            requested_rad,
+            state.stream.seen_tick_ms,
         )
 
     def record_applied(self, position_rad: Sequence[float]) -> None:
@@ -153,6 +158,12 @@ class CommandArbiter:
         if authority.latch is not None:
             return Mode.STOPPED
         return Mode.HOLDING if allowed <= 0 else None
+
+    def _requested(self) -> Sequence[float]:
+        """Target of the present source before limits; empty if it has none."""
+        if self._state.mode is Mode.STREAMING:
+            return self._state.stream.requested_rad
+        return self._state.goals.requested_rad if self._state.mode is Mode.ACTION else ()
 
     def _limited(self) -> tuple[str, ...]:
         """Limits that change the motion, for telemetry."""

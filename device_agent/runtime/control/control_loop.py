@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,17 +47,30 @@ RESPONSE_S = 0.7
 """A loop without a new period for this time hangs [s]; with the supervisor's period it is noticed within 1 s."""
 _CONNECT_S = 30.0
 """Maximum time of a reconnection, during which the device holds [s]."""
+REST_RAD_S = 0.05
+"""A joint that is measured below this speed is at rest; above the noise of encoders [rad/s]."""
 CONTROL_LOOP = "control loop"
 _MIN_ELAPSED_S = 1e-4
 """Lower bound of the time since the last period: ``ruckig`` cannot plan for a duration of 0 [s]."""
 _log = logging.getLogger(__name__)
 
 
+class Period(NamedTuple):
+    """One control period: its start [s], what was observed, commanded and applied, and whether the robot moves."""
+
+    now_s: float
+    observation: Observation
+    output: ControlOutput
+    applied_rad: Sequence[float]
+    moving: bool
+
+
 class ControlLoop:
     """One thread that never waits for disk or network. Callers of ``wake`` may run a period in their own thread.
 
     ``publish`` receives telemetry at 20 Hz at rest, at 50 Hz in motion, and with each applied setpoint at up to 50 Hz.
-    ``check_interlocks`` is called before each period with the monotonic clock [s]. Neither may block.
+    ``check_interlocks`` is called before each period with the monotonic clock [s], ``measure`` after each period with
+    the clock, its output and whether the robot moves, and then ``record`` with the period. None of them may block.
     """
 
     def __init__(
@@ -69,9 +82,13 @@ class ControlLoop:
         name: str,
         publish: Callable[[JointTelemetry], None],
         check_interlocks: Callable[[float], None],
+        measure: Callable[[float, ControlOutput, bool], None],
         load: LoadGovernor,
+        record: Callable[[Period], None] | None = None,
     ) -> None:
         self._load = load
+        self._record = record
+        self._measure = measure
         self._period_s = robot_type.period_ms / 1000
         self._driver = driver
         self._base = driver if robot_type.base is not None and isinstance(driver, MobileDriver) else None
@@ -222,6 +239,10 @@ class ControlLoop:
             )
             applied = observation.position_rad if self._device_stopped else self._command(output)
             self._controller.record_period(output)
+            moving = self._moves(observation, output)
+            self._measure(now_s, output, moving)
+            if self._record is not None:
+                self._record(Period(now_s, observation, output, applied, moving))
             self._publish_telemetry(now_s, observation, output, applied)
         except DriverError as error:
             self._error = str(error)
@@ -244,6 +265,11 @@ class ControlLoop:
         if self._base is not None:
             self._controller.record_driven(output.twist, self._base.drive(output.twist))
         return applied
+
+    def _moves(self, observation: Observation, output: ControlOutput) -> bool:
+        """Whether the robot is commanded to move, or moves itself in an action."""
+        measured = output.mode is Mode.ACTION and any(abs(each) > REST_RAD_S for each in observation.velocity_rad_s)
+        return measured or self._controller.moving
 
     def _observe(self) -> Observation:
         """The newest valid measurement.
@@ -275,11 +301,13 @@ class ControlLoop:
     def _handle_fault(self) -> None:
         self._device_faults = ()  # unknown
         self._controller.set_fault(self._error)
-        self._controller.record_period(self._controller.update(time.monotonic()))
+        output = self._controller.update(time.monotonic())
+        self._controller.record_period(output)
         self._thread.beat(_CONNECT_S)
         while not self._stopping.wait(_RECONNECT_PERIOD_S):
             self._thread.beat(_CONNECT_S)
-            with contextlib.suppress(DriverError):
+            self._measure(time.monotonic(), output, False)
+            with contextlib.suppress(Exception):  # a defect of the driver was logged; the loop must not end
                 self._driver.connect()
                 self.observation = self._observe()
                 self._controller.clear_fault(self.observation.position_rad)

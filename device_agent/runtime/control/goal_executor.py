@@ -187,6 +187,16 @@ class GoalExecutor:
         return max(self.motion.braking_time_s(), 0.0 if self.base is None else self.base.braking_time_s())
 
     @property
+    def requested_rad(self) -> Sequence[float]:
+        """Final positions of the goal, shape (n,) [rad]; empty if it has none."""
+        match self.goal:
+            case JointGoal(target_rad=target):
+                return tuple(target)
+            case TrajectoryGoal(trajectory=trajectory):
+                return tuple(trajectory.position_rad[-1].tolist())
+        return ()
+
+    @property
     def twist(self) -> Twist:
         """Commanded twist of the base."""
         return REST if self.base is None else self.base.twist

@@ -38,6 +38,8 @@ class SetpointStream:
         applied_sequence: Sequence of the newest applied setpoint; 0 before the first one of a lease.
         sent_ms: The operator's clock in that setpoint.
         loop_age_ms: Loop age of the newest setpoint.
+        seen_tick_ms: Tick that the newest applied setpoint echoes; 0 before the first one of a lease.
+        requested_rad: Requested positions of all joints before limits; empty if no positions are requested.
     """
 
     def __init__(self, robot_type: RobotType, limits: MotionLimits, geometry: RobotGeometry | None) -> None:
@@ -46,6 +48,7 @@ class SetpointStream:
         self._max_speeds = [joint.max_velocity_rad_s for joint in robot_type.joints]
         followers = {mirror.joint for mirror in robot_type.mimic_joints}
         self._leaders = {i: joint.name for i, joint in enumerate(robot_type.joints) if joint.name not in followers}
+        self._names = [joint.name for joint in robot_type.joints]
         self._has_base = robot_type.base is not None
         self._limiter = LatencyLimiter(geometry, watchdog_s=WATCHDOG_S, max_age_s=MAX_LOOP_AGE_S)
         self._speed = robot_type.streaming_speed
@@ -64,7 +67,8 @@ class SetpointStream:
         self._speed_limits: tuple[str, ...] = ()
         self._base_limits: tuple[str, ...] = ()
         self._obstacle: tuple[list[float], str] | None = None
-        self.applied_sequence, self.sent_ms, self.loop_age_ms = 0, 0.0, 0.0
+        self.applied_sequence, self.sent_ms, self.loop_age_ms, self.seen_tick_ms = 0, 0.0, 0.0, 0
+        self.requested_rad: tuple[float, ...] = ()
 
     def check(self, setpoint: Setpoint, *, tick_ms: int) -> None:
         """Check that a setpoint is newer than all before, also rejected ones, and that it echoes recent telemetry.
@@ -120,7 +124,7 @@ class SetpointStream:
 
     def hold_here(self, position_rad: Sequence[float]) -> None:
         """Make ``position_rad``, shape (n,) [rad], the target of joints that the next setpoint does not name."""
-        self._target = list(position_rad)
+        self._target, self.requested_rad = list(position_rad), ()
 
     def clear(self) -> None:
         """Apply no setpoint until the next one arrives."""
@@ -162,6 +166,7 @@ class SetpointStream:
         if self._setpoint is not None and self._setpoint.sequence != self.applied_sequence:
             self._set_target(self._setpoint.target, motion)
             self.applied_sequence, self.sent_ms = self._setpoint.sequence, self._setpoint.sent_ms
+            self.seen_tick_ms = self._setpoint.echo_tick_ms
         if self._obstacle is not None and (motion.moving or _same(self._obstacle[0], self._requested())):
             # The motion brakes to rest before an obstacle, and continues when the operator requests another target.
             motion.brake()
@@ -182,9 +187,11 @@ class SetpointStream:
             return
         if isinstance(self._joint_target, JogTarget):  # joints without a position stay where the jog has moved them
             self._target, self._range_limits = list(motion.position_rad), ()
-        self._joint_target = target
+        self._joint_target, self.requested_rad = target, ()
         if isinstance(target, JointTarget):
             self._range_limits = self._limits.clamp(target.position_rad, self._target)
+            held = zip(self._names, self._target, strict=True)
+            self.requested_rad = tuple(target.position_rad.get(name, position) for name, position in held)
 
     def _requested(self) -> list[float]:
         """The request for the joints as numbers, for comparison."""

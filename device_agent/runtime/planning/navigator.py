@@ -63,6 +63,11 @@ class Navigator:
         limits = Twist(base.max_linear_m_s, 0.0, base.max_angular_rad_s)
         return cls((x_m, y_m), yaw_rad, limits=limits, radius_m=base.radius_m)
 
+    @property
+    def max_speed_m_s(self) -> float:
+        """Largest speed towards the goal [m/s]."""
+        return _SPEED_SHARE * self._limits.forward_m_s
+
     def timeout_s(self, refused: Refused) -> float:
         """Time to wait until a rejected motion may become possible [s]."""
         if refused.code not in _TRANSIENT:
@@ -95,7 +100,7 @@ class Navigator:
         error = math.remainder(math.atan2(y - pose.y_m, x - pose.x_m) - pose.yaw_rad, 2 * math.pi)
         forward = 0.0
         if abs(error) < _FACING_RAD:
-            forward = min(_SPEED_SHARE * self._limits.forward_m_s, _GAIN_1_S * distance_m) * math.cos(error)
+            forward = min(self.max_speed_m_s, _GAIN_1_S * distance_m) * math.cos(error)
         return Twist(forward, 0.0, self._turn(error))
 
     def is_near(self, pose: Pose2D) -> bool:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.driver import Observation
-from device_agent.ports.sensor import Camera, Reducible, SensorError
+from device_agent.ports.sensor import Camera, Frame, Reducible, SensorError
 from device_agent.ports.threads import Recovery, SupervisedThread
 from device_agent.protocol import MAX_VALUES, Fault, Measurements, Mode
 from device_agent.protocol.camera_frames import CameraFrame
@@ -25,6 +25,9 @@ from device_agent.runtime.room.room_device import RoomDevice
 _CHECK_PERIOD_S = 0.05
 """Period of the checks for Stop and hold [s]."""
 _RECONNECT_PERIOD_S = 1.0
+_START_S = 2.0
+"""The start of the agent waits at most this time for the first connection of each device [s]."""
+_NOT_CONNECTED = "The device has not responded yet."
 _HOLD_MODES = frozenset({Mode.STOPPED, Mode.HOLDING, Mode.FAULT})
 """Modes in which the device must not move."""
 SENSOR_LOOP = "sensor loop"
@@ -56,6 +59,7 @@ class SensorLoop:
         publish: Callable[[str, Measurements], None],
         publish_frame: Callable[[str, CameraFrame], None],
         check_interlocks: Callable[[float], None],
+        record_frame: Callable[[str, Frame], None] | None = None,
     ) -> None:
         self._driver = room_device.driver
         self._reducible = room_device.driver if isinstance(room_device.driver, Reducible) else None
@@ -66,10 +70,13 @@ class SensorLoop:
         self._publish = publish
         self._publish_frame = publish_frame
         self._check_interlocks = check_interlocks
+        self._record_frame = record_frame
         self._sources = [_Source(stream, is_camera=False) for stream in room_device.streams]
         self._sources += [_Source(camera, is_camera=True) for camera in room_device.cameras]
+        self._kinds = {camera.name: camera.kind for camera in room_device.manifest.cameras}
         self._held = False
         self._logged = ""
+        self._attempted = threading.Event()
         self._stopping = threading.Event()
         self._thread = SupervisedThread(
             self._run,
@@ -83,15 +90,13 @@ class SensorLoop:
         self.observation: Observation | None = None
 
     def start(self) -> None:
-        """Connect the driver and start to read. A missing sensor is a fault; the agent still runs."""
+        """Start to connect the driver and to read. A missing sensor is a fault; the agent still runs."""
         self.observation = _NO_JOINTS
         self._controller.start_at(())
-        try:
-            self._driver.connect()
-        except SensorError as error:
-            self._set_fault(str(error))
+        self._controller.set_fault(_NOT_CONNECTED)  # not published if the thread clears or replaces it in time
         self._room_device.watchdog.reset()
         self._thread.start()
+        self._attempted.wait(_START_S)
 
     def faults(self) -> tuple[Fault, ...]:
         """Faults of the streams; none while the sensor itself has a fault."""
@@ -126,6 +131,7 @@ class SensorLoop:
                     self._driver.connect()
                     self._room_device.watchdog.reset()
                     self._controller.clear_fault(())
+                    self._attempted.set()
                 self._check_interlocks(now_s)
                 self._apply(self._controller.update(now_s))
                 if self._reducible is not None:
@@ -184,17 +190,24 @@ class SensorLoop:
         picture = camera.frame(source.name)
         if picture is None:
             return
+        if picture.kind != self._kinds[source.name]:
+            raise SensorError(
+                f"{source.name}: the manifest declares the kind '{self._kinds[source.name]}', but the driver sends "
+                f"'{picture.kind}'; correct the kind"
+            )
         self._room_device.watchdog.record(source.name, picture.content)
+        if self._record_frame is not None:
+            self._record_frame(source.name, picture)
         source.sequence += 1
         tick = round(picture.taken_s * 1000)
         try:
-            self._publish_frame(
-                source.name, CameraFrame(source.sequence, tick, picture.width, picture.height, picture.content)
-            )
+            frame = CameraFrame(source.sequence, tick, picture.width, picture.height, picture.content, picture.kind)
+            self._publish_frame(source.name, frame)
         except ProtocolError as error:
             raise SensorError(f"{source.name}: {error}; configure smaller pictures") from error
 
     def _set_fault(self, message: str) -> None:
         self._controller.set_fault(message)
+        self._attempted.set()
         with contextlib.suppress(SensorError):
             self._apply(self._controller.update(time.monotonic()))

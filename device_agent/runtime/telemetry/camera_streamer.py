@@ -2,15 +2,17 @@
 
 Rendering or taking a picture costs far more than the rest of an idle robot. The agent does not know its viewers, but
 it knows whether the robot is controlled. During control and for a while after, each camera streams at its own rate;
-otherwise once a second. Without a link there are no frames.
+otherwise once a second. Without a link no frames are sent. Frames for a recording do not depend on link and viewers.
 """
 
 import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from device_agent.ports.driver import DriverError, HasCameras
+from device_agent.ports.sensor import Frame
 from device_agent.protocol import Stream
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
@@ -23,8 +25,18 @@ LINGER_S = 60.0
 """Time after the end of control in which cameras keep their rate, because the operator may still watch [s]."""
 
 
+class FrameRecording(Protocol):
+    """Records frames of the cameras of a device; never blocks."""
+
+    def is_due(self, camera: str, now_s: float) -> bool:
+        """Whether a frame would be recorded that the camera takes now."""
+
+    def record(self, camera: str, picture: Frame) -> None:
+        """Record a frame if that is due."""
+
+
 class CameraStreamer(PeriodicPoller):
-    """Polls a driver for camera frames, and publishes them."""
+    """Polls a driver for camera frames; publishes and records them."""
 
     def __init__(
         self,
@@ -35,11 +47,13 @@ class CameraStreamer(PeriodicPoller):
         publish: Callable[[str, CameraFrame], None],
         is_controlled: Callable[[], bool],
         load: LoadGovernor,
+        recording: FrameRecording | None = None,
     ) -> None:
         sources = () if driver is None else cameras
         super().__init__(sources, self._stream, device=name, kind="camera", share=lambda: load.share("cameras"))
         self._publish = publish
         self._is_controlled = is_controlled
+        self._recording = recording
         self._linked = False
         self._controlled_s = -math.inf
         self._last_frame_s: dict[str, float] = {}
@@ -61,10 +75,15 @@ class CameraStreamer(PeriodicPoller):
         return True
 
     def _stream(self, camera: str) -> None:
-        if not self._is_due(camera):
+        publish = self._is_due(camera)
+        if not publish and (self._recording is None or not self._recording.is_due(camera, time.monotonic())):
             return
         picture = None if self._driver is None else self._driver.frame(camera)
         if picture is None:
+            return
+        if self._recording is not None:
+            self._recording.record(camera, picture)
+        if not publish:
             return
         self._sequences[camera] += 1
         tick = round(picture.taken_s * 1000)

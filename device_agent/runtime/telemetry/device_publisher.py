@@ -18,8 +18,10 @@ from device_agent.protocol import (
     AckStatus,
     ActionState,
     BaseLimits,
+    CameraConsent,
     Control,
     Description,
+    Event,
     Fault,
     InterlockDescription,
     JointTelemetry,
@@ -73,6 +75,9 @@ class StateSnapshot:
     restrictions: tuple[Restriction, ...]
     stiffness: Mapping[str, float]
     load: int = 0
+    recording: bool = False
+    recorded_cameras: tuple[str, ...] = ()
+    camera_consent: CameraConsent | None = None
 
     def key(self) -> tuple[object, ...]:
         """The part whose change triggers a new ``state``; progress alone does not."""
@@ -109,7 +114,9 @@ class DevicePublisher:
         publish: Publish,
         outbox: Outbox,
         traces: CommandTraces | None = None,
+        record_event: Callable[[Event], None] | None = None,
     ) -> None:
+        self._record_event = record_event
         self._address = address
         self._name = address[2]
         self._label = label
@@ -162,14 +169,16 @@ class DevicePublisher:
             **fields,  # type: ignore[arg-type]
         )
 
-    def report(self, command: str, status: AckStatus, **fields: Any) -> None:
-        """Journal and publish the next ack of a command.
+    def report(self, command: str, status: AckStatus, *, recorded: EventRecord | None = None, **fields: Any) -> None:
+        """Journal and publish the next ack of a command. ``recorded``: an event for the recording of the session.
 
         A terminal ack is also published if it cannot be journalled: ``update_journal`` journals it later.
 
         Raises:
             JournalError: Another ack cannot be journalled; it is not published.
         """
+        if recorded is not None and self._record_event is not None:
+            self._record_event(event_message(self._name, recorded))
         ack = self.create_ack(command, status, **fields)
         try:
             self._journal.record(ack)
@@ -263,6 +272,9 @@ class DevicePublisher:
             restrictions=snapshot.restrictions,
             stiffness=dict(snapshot.stiffness),
             load=snapshot.load,
+            recording=snapshot.recording,
+            recorded_cameras=snapshot.recorded_cameras,
+            camera_consent=snapshot.camera_consent,
             rates_hz=dict(self._rates.rates_hz(now_s)),
         )
         if self._retain(self._topic(topics.STATE), state):
@@ -285,6 +297,8 @@ class DevicePublisher:
     def publish_event(self, event: EventRecord) -> None:
         """Publish an event through the outbox."""
         message = event_message(self._name, event)
+        if self._record_event is not None:
+            self._record_event(message)
         self._outbox.add_event(self._topic(topics.EVENT), codec.encode(message), at_ms=message.at_ms)
 
     def count_rejection(self, code: str) -> None:

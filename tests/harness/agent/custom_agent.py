@@ -69,7 +69,7 @@ class AgentProcess:
     Args:
         folder: Home folder of the agent.
         broker: A running broker.
-        toml: Text of ``agent.toml`` after server and name, with one device ``arm``.
+        toml: Text of ``agent.toml`` after server and name, with one device ``arm``. Nothing is recorded by default.
 
     Attributes:
         messages: Topic and payload of each message received from the agent.
@@ -81,7 +81,8 @@ class AgentProcess:
         self.store.private_key(create=True)
         keys = {signing.key_id(self.key.public_key()): signing.public_text(self.key.public_key())}
         self.store.save_pairing(Pairing(agent=AGENT, space=SPACE, account="ann", keys=keys))
-        (folder / "agent.toml").write_text(f'server = "http://server.invalid"\nname = "arm"\n{toml}')
+        recording = "" if "[recording]" in toml else "\n[recording]\nenabled = false\n"
+        (folder / "agent.toml").write_text(f'server = "http://server.invalid"\nname = "arm"\n{toml}{recording}')
         self.process: subprocess.Popen[bytes] | None = None
         self.messages: list[tuple[str, bytes]] = []
         self.use_broker(broker)

@@ -34,10 +34,13 @@ from device_agent.protocol import (
     topics,
 )
 from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.protocol.manifests.tasks import Tasks
 from device_agent.protocol.security import setpoints, signing
+from device_agent.runtime.actions.task_monitors import TaskMonitors
 from device_agent.runtime.device import Device
 from device_agent.runtime.load import LoadGovernor
 from device_agent.runtime.readings import ReadingCache
+from device_agent.runtime.recording.recorder import Recorder
 from device_agent.runtime.storage.journal import Journal
 from device_agent.runtime.storage.outbox_store import OutboxStore
 from device_agent.runtime.supervision import Supervisor
@@ -66,6 +69,9 @@ class DeviceHarness:
         uploads: Uploads | None = None,
         supervisor: Supervisor | None = None,
         traces: CommandTraces | None = None,
+        recorder: Recorder | None = None,
+        tasks: Tasks | None = None,
+        room: Sequence[tuple[str, str]] = (),
     ) -> None:
         self.load = LoadGovernor()
         self.key = signing.generate()
@@ -83,7 +89,7 @@ class DeviceHarness:
         self.outbox.link_changed(True)
         self.outbox.start()
         self.readings = ReadingCache(
-            space="s", agent="a", own=["arm"], named=[(rule.device, rule.stream) for rule in interlocks]
+            space="s", agent="a", own=["arm"], named=[*((rule.device, rule.stream) for rule in interlocks), *room]
         )
         self.device = Device(
             name="arm",
@@ -107,6 +113,8 @@ class DeviceHarness:
             load=self.load,
             supervisor=supervisor,
             traces=traces,
+            recorder=recorder,
+            task_monitors=TaskMonitors(tasks, self.driver, self.readings),
         )
 
     def start(self) -> None:

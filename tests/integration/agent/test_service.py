@@ -185,6 +185,7 @@ def test_the_service_runs_unprivileged_and_ends_on_a_signal(processes: CloudProc
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in home.iterdir()}
     assert stat.S_IMODE(home.stat().st_mode) == 0o700
     assert {"identity.pem", "agent.toml", "pairing.json", "journal.db"} <= modes.keys()
+    assert modes.pop("recordings") == 0o700
     assert set(modes.values()) == {0o600}, modes
     assert "connected" in findings(folder)["link"]
 

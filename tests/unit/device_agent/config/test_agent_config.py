@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from device_agent.config.agent_config import AgentConfig, Buffer, DeviceEntry, HttpPolling, RoomStream
+from device_agent.config.agent_config import AgentConfig, Buffer, DeviceEntry, HttpPolling, Recording, RoomStream
 from device_agent.config.errors import ConfigError
 from device_agent.config.interlock_rule import InterlockRule
-from device_agent.protocol import Stream
+from device_agent.protocol import CameraStream, Stream
 from device_agent.protocol.manifests.robot_type import Diagnostic
 from device_agent.protocol.manifests.room import Control, Watch
 
@@ -20,7 +20,7 @@ BOILER = DeviceEntry(
     type="boiler",
     driver="modbus",
     streams=(Stream(name="water", rate_hz=0.5),),
-    cameras=(Stream(name="view", rate_hz=1.0),),
+    cameras=(CameraStream(name="view", rate_hz=1.0),),
     captures=("image",),
     controls=(Control(name="target", label="Target", unit="°C", lower=10.0, upper=80.0),),
     diagnostics=(Diagnostic(stream="water", fields="temperature_c", label="Water", high=90.0),),
@@ -63,6 +63,7 @@ def test_saved_configuration_is_loaded(
         room=(RoomStream(device="abc-lamp", stream="light"),),
         ca="server-ca.pem" if options else "",
         buffer=Buffer(max_mb=2),
+        recording=Recording(enabled=False, max_gb=0.5),
         allow_unconfined_scripts=bool(options),
     )
     config.save(folder)
@@ -87,6 +88,9 @@ def test_defaults(tmp_path: Path) -> None:
         ("[buffer]\nmax_mb = 0.5\n", "max_mb"),
         ("[buffer]\nmax_age_h = nan\n", "max_age_h"),
         ("[buffer]\nmeasurements_hz = 0\n", "measurements_hz"),
+        ("[recording]\nmax_gb = 0\n", "max_gb"),
+        ("[recording]\nmax_age_days = 0\n", "max_age_days"),
+        ("[recording]\nmin_free_gb = -1\n", "min_free_gb"),
         ('[[room]]\ndevice = "pir"\nstream = "presence"\n', "'pir' is not a device of this agent .arm.; name a"),
         (f"{INTERLOCK}[[devices.interlocks]]\nspeed = 0.5\n", "device"),
         (INTERLOCK.replace("equals = true", ""), "exactly one of above, below, equals"),
@@ -121,6 +125,7 @@ def test_enrolling_again_keeps_manual_settings() -> None:
         devices=(DeviceEntry(name="arm", type="ur5", interlocks=RULES[:1]),),
         room=(RoomStream(device="a-lamp", stream="light"),),
         buffer=Buffer(max_mb=2),
+        recording=Recording(enabled=False, max_gb=0.5),
         allow_unconfined_scripts=True,
     )
     new = AgentConfig(server="http://t", name="n", devices=(ARM, DeviceEntry(name="leg", type="ur5")))
@@ -128,3 +133,4 @@ def test_enrolling_again_keeps_manual_settings() -> None:
     assert merged.server == "http://t"
     assert [device.interlocks for device in merged.devices] == [RULES[:1], ()]
     assert (merged.room, merged.buffer, merged.allow_unconfined_scripts) == (previous.room, previous.buffer, True)
+    assert merged.recording == previous.recording

@@ -178,6 +178,7 @@ def test_invalid_limits_are_rejected(before: str, after: str, message: str) -> N
         ('[{ name = "eyes", rate_hz = 30.0 }]', "camera 'eyes': rate_hz is 30; the limit is 10"),
         ('[{ name = "eyes", rate_hz = 0.0 }]', "rate_hz of camera 'eyes' is 0"),
         ('[{ name = "eyes", rate_hz = 1.0 }, { name = "eyes", rate_hz = 1.0 }]', "two cameras"),
+        ('[{ name = "eyes", rate_hz = 1.0, kind = "depth" }]', "camera 'eyes': kind is 'depth'"),
     ],
 )
 def test_invalid_cameras_are_rejected(cameras: str, message: str) -> None:
@@ -229,6 +230,8 @@ def test_invalid_diagnostics_are_rejected(lines: str) -> None:
         ("time_s = 1.5", "time_s = 301.0", "to 300 at most"),
         ("track_m = 0.2", "track_m = 0.0", "simulation.wheels: track_m is 0.0"),
         ("track_m = 0.2", "track_m = 0.2\nspeed = 1.0", "speed"),
+        ("[simulation.wheels]", '[simulation]\nomni_wheels = ["a", "b"]\n[simulation.wheels]', "omni_wheels"),
+        ("[simulation.wheels]", '[simulation]\nomni_wheels = ["a", "b", "c"]\n[simulation.wheels]', "either wheels or"),
         ("idle_w = 27.0", "idle_w = inf", "simulation.battery: idle_w is inf"),
         ("empty_v = 18.6", "empty_v = 28.6", "simulation.battery: empty_v must not be above full_v"),
     ],
@@ -248,3 +251,13 @@ def test_inconsistent_capabilities_are_rejected(before: str, after: str, message
 )
 def test_invalid_walks_are_rejected(before: str, after: str, message: str) -> None:
     require_rejection(NAO, before, after, message)
+
+
+def test_a_gripper_has_a_positive_speed() -> None:
+    text = (ROBOTS / "ur5_gripper" / "robot.toml").read_text(encoding="utf-8")
+    simulation = parse(text).simulation
+    assert simulation is not None
+    assert simulation.gripper is not None
+    assert simulation.gripper.actuator == "gripper"
+    with pytest.raises(ProtocolError, match=r"simulation\.gripper: speed_m_s is 0"):
+        parse(text.replace("speed_m_s = 0.1", "speed_m_s = 0.0"))

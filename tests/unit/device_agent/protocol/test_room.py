@@ -77,6 +77,14 @@ def test_a_room_device_is_a_type_without_joints():
         (with_change("position_m = [1.0", "position_m = [9.0"), "robot 'arm' is outside of the plan"),
         (with_change("position_m = [1.0, 0.0, 0.7]", "position_m = [1.0, 0.0, nan]"), "robot 'arm': all numbers must"),
         (with_change("rate_hz = 1.0", "rate_hz = 900.0"), "rate_hz of stream 'settings' of device 'lamp'"),
+        (
+            with_change("streams = [", 'cameras = [{ name = "view", rate_hz = 1.0, kind = "thermal" }]\nstreams = ['),
+            "kind 'thermal' of camera 'view' of device 'lamp' is unknown; use one of: colour, depth, scan, people",
+        ),
+        (
+            with_change("streams = [", 'cameras = [{ name = "view", rate_hz = 1.0, kind = 2 }]\nstreams = ['),
+            "Expected `str`, got `int`",
+        ),
         (with_change("lower = 0.0", "lower = 2.0"), "control 'level' of device 'lamp': lower must be below upper"),
         (with_change("upper_m = [1.0, 1.0, 1.0]", "upper_m = [1.0, 1.0, 0.0]"), "zone 'bed': lower_m must be below"),
         (with_change("[1.0, 0.5]]", "[0.0, 0.0]]"), "path_m of person 'person' has the same corner twice in a row"),

@@ -117,7 +117,8 @@ def test_a_permission_that_expired_during_the_switch_undoes_it(
             robot.reasons = ["arm: it moves"] * 1000
 
     monkeypatch.setattr(stub.installation, "link", slow)
-    with pytest.raises(SwitchError, match="it moves"):
+    # A slow machine has no time left to ask for another permission.
+    with pytest.raises(SwitchError, match=r"not switched after .*(it moves|permission to restart expired)"):
         switch(stub, wait_s=0.05)
     assert (expired, stub.links, robot.restarted.is_set()) == (["2"], ("1", ""), False)
     assert stub.installation.trial() is None

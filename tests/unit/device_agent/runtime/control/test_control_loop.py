@@ -43,6 +43,7 @@ class LoopFixture:
         self.controller.start_at((0.0, 0.0))
         self.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=time.monotonic())
         self.published: list[JointTelemetry] = []
+        self.measured: list[tuple[Mode, bool]] = []
         self.load = LoadGovernor()
         self.loop = ControlLoop(
             kind,
@@ -51,6 +52,7 @@ class LoopFixture:
             name="arm",
             publish=self.published.append,
             check_interlocks=lambda _now_s: None,
+            measure=lambda _now_s, output, moving: self.measured.append((output.mode, moving)),
             load=self.load,
         )
         self._sequence = 0
@@ -94,6 +96,21 @@ class InlineDriver(FakeDriver):
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
         self.threads.append(threading.current_thread().name)
         return super().send(position_rad)
+
+
+@pytest.mark.parametrize(("mode", "moves"), [(Mode.ACTION, True), (Mode.IDLE, False)])
+def test_a_robot_that_moves_itself_moves_in_an_action_only(mode: Mode, *, moves: bool) -> None:
+    setup = LoopFixture()
+    itself = Observation((0.0, 0.0), (0.0, 0.2), (0.0, 0.0), ())
+    output = setup.controller.update(time.monotonic(), AT_REST.position_rad)
+    assert setup.loop._moves(itself, replace(output, mode=mode)) is moves
+    assert not setup.loop._moves(AT_REST, replace(output, mode=mode))
+
+
+def test_a_lost_device_is_measured_at_rest(make_loop: MakeLoop) -> None:
+    setup = make_loop(period_ms=20)
+    with mock.patch.object(setup.driver, "observe", side_effect=DriverError("lost")):
+        wait_until(lambda: (Mode.FAULT, False) in setup.measured, "the period of a lost device")
 
 
 def test_a_device_at_rest_follows_one_of_several_setpoints_early(make_loop: MakeLoop) -> None:

@@ -11,16 +11,17 @@ import pytest
 
 from device_agent.perception.occupancy_grid import GridFloorMap, OccupancyGrid
 from device_agent.ports.driver import REST, Twist
-from device_agent.protocol import GoTo
+from device_agent.protocol import GoTo, Measurements
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import navigator as navigator_module
 from device_agent.runtime.planning.grid_search import find_path
 from device_agent.runtime.planning.localization import Pose2D, PoseEstimator
 from device_agent.runtime.planning.navigator import BLOCKED_TIMEOUT_S, START_TIMEOUT_S, UPDATE_PERIOD_S, Navigator
-from device_agent.runtime.readings import Reading
+from device_agent.runtime.readings import Reading, ReadingCache
 from tests.fakes.drivers import BASE, PERIOD_S, robot_type
 from tests.harness.agent.controller_fixture import ControllerFixture, refuses
+from tests.harness.agent.device_harness import eventually
 from tests.unit.device_agent.runtime.actions.robot_api_fixture import device_context
 
 LIMITS = Twist(0.3, 0.0, 1.5)
@@ -130,15 +131,99 @@ def test_an_occupied_goal_has_a_short_timeout_before_the_start() -> None:
 
 
 def test_room_positions_correct_or_replace_the_odometry() -> None:
-    estimator = PoseEstimator("qbo")
+    estimator = PoseEstimator()
     odometry = Reading({"x_m": 1.0, "y_m": 0.0, "yaw_rad": 0.5}, 0.02)
     observed = Reading({"x_m.qbo": 1.2, "y_m.qbo": 0.1, "age_s.qbo": 0.2}, 0.1)
-    assert estimator.estimate(odometry, None) == Pose2D(1.0, 0.0, 0.5)
+    assert estimator.estimate("qbo", odometry, None) == Pose2D(1.0, 0.0, 0.5)
     corrected = pytest.approx((1.2, 0.1, 0.5))
-    assert astuple(estimator.estimate(odometry, observed)) == corrected
-    assert astuple(estimator.estimate(odometry, None)) == corrected, "the correction remains"
+    assert astuple(estimator.estimate("qbo", odometry, observed)) == corrected
+    assert astuple(estimator.estimate("qbo", odometry, None)) == corrected, "the correction remains"
     observed = Reading({"x_m.nao": 1.2, "y_m.nao": 0.1, "yaw_rad.nao": 0.3}, 0.1)
-    assert PoseEstimator("nao").estimate(None, observed) == Pose2D(1.2, 0.1, 0.3)
+    assert PoseEstimator().estimate("nao", None, observed) == Pose2D(1.2, 0.1, 0.3)
+
+
+def wheels(x_m: float) -> Reading:
+    return Reading({"x_m": x_m, "y_m": 0.0, "yaw_rad": 0.0}, 0.02)
+
+
+def seen(x_m: float, *, age_s: float = 0.1) -> Reading:
+    return Reading({"x_m.qbo": x_m, "y_m.qbo": 0.0, "age_s.qbo": age_s}, 0.1)
+
+
+@pytest.mark.parametrize("drift", [0.02, -0.08])
+def test_slow_drift_of_the_odometry_is_corrected(drift: float) -> None:
+    estimator = PoseEstimator()
+    for step in range(50):
+        pose = estimator.estimate("qbo", wheels(step * 0.1), seen(step * 0.1 * (1 + drift)))
+    assert pose.x_m == pytest.approx(4.9 * (1 + drift), abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "motions",
+    [
+        [(step * 0.024, 0.0) for step in range(20)],  # the wheels slip
+        [(0.0, 0.0), (0.0, 0.3)],  # perception confuses it with another object
+        [(0.0, 0.0), (0.0, 0.0), None, (0.0, 0.3)],  # the same between two motions
+    ],
+)
+def test_odometry_and_room_that_contradict_each_other_end_the_motion(motions: list[tuple[float, float] | None]) -> None:
+    estimator = PoseEstimator()
+    with refuses("position_conflict"):
+        for motion in motions:
+            if motion is None:
+                estimator.start(0.24)
+            else:
+                estimator.estimate("qbo", wheels(motion[0]), seen(motion[1]))
+    x_m, y_m = motions[-1] or (0.0, 0.0)
+    estimator.start(0.24)
+    assert estimator.estimate("qbo", wheels(x_m), seen(y_m)).x_m == pytest.approx(y_m), "a new motion starts anew"
+
+
+def test_drift_while_a_person_drives_the_robot_does_not_end_the_next_motion() -> None:
+    estimator = PoseEstimator()
+    estimator.start(0.24)
+    estimator.estimate("qbo", wheels(0.0), seen(0.0))
+    estimator.start(0.24)
+    assert estimator.estimate("qbo", wheels(3.0), seen(2.5)).x_m == pytest.approx(2.5)
+
+
+def test_the_path_through_a_blind_spot_counts_for_the_drift() -> None:
+    estimator = PoseEstimator()
+    estimator.start(0.24)
+    estimator.estimate("qbo", wheels(0.0), seen(0.0))
+    for x_m in [*(step * 0.1 for step in range(16)), *(step * 0.1 for step in range(15, -1, -1))]:
+        estimator.estimate("qbo", wheels(x_m), None)
+    assert estimator.estimate("qbo", wheels(0.0), seen(0.4)).x_m == pytest.approx(0.04), "3 m there and back"
+
+
+def test_slip_out_of_view_is_a_conflict_at_the_next_motion() -> None:
+    estimator = PoseEstimator()
+    estimator.start(0.24)
+    estimator.estimate("qbo", wheels(0.0), seen(0.0))
+    for step in range(1, 11):
+        estimator.estimate("qbo", wheels(step * 0.1), None)
+    estimator.start(0.24)
+    with refuses("position_conflict"):
+        estimator.estimate("qbo", wheels(1.0), seen(0.0))
+
+
+def test_late_positions_of_a_moving_robot_do_not_contradict_its_odometry() -> None:
+    estimator = PoseEstimator()
+    estimator.start(1.0)
+    for step in range(20):
+        estimator.estimate("qbo", wheels(step * 0.1), seen(max(0, step - 6) * 0.1, age_s=0.6))
+
+
+@pytest.mark.parametrize("lost", [seen(0.0, age_s=16.0), None])
+def test_a_robot_that_the_room_has_lost_neither_starts_nor_arrives(lost: Reading | None) -> None:
+    estimator = PoseEstimator()
+    estimator.estimate("qbo", wheels(0.0), seen(0.0))
+    assert estimator.estimate("qbo", wheels(0.5), lost).x_m == 0.5, "it may drive through a blind spot"
+    with refuses("no_position"):
+        estimator.estimate("qbo", wheels(0.5), lost, confirm=True)
+    estimator.start(0.24)
+    with refuses("no_position"):
+        estimator.estimate("qbo", wheels(0.5), lost)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +239,7 @@ def test_room_positions_correct_or_replace_the_odometry() -> None:
 )
 def test_a_robot_without_a_position_does_not_drive(observed: Reading | None) -> None:
     with pytest.raises(Refused, match="the position of the robot is unknown"):
-        PoseEstimator("nao").estimate(None, observed)
+        PoseEstimator().estimate("nao", None, observed)
 
 
 def test_at_the_goal_the_robot_only_turns() -> None:
@@ -166,11 +251,23 @@ def test_at_the_goal_the_robot_only_turns() -> None:
 
 
 class MobileRobot:
-    """A base that follows the commands of a ``RobotApi`` in its own thread."""
+    """A base that follows the commands of a ``RobotApi`` in its own thread.
+
+    Args:
+        obstacle_map: Floor of the room.
+        observed: Odometry at a pose; by default the pose.
+        seen: Position and age that the room publishes at a pose; by default nothing.
+    """
 
     def __init__(
-        self, obstacle_map: OccupancyGrid | None, *, observed: Callable[[Pose2D], Pose2D] | None = None
+        self,
+        obstacle_map: OccupancyGrid | None,
+        *,
+        observed: Callable[[Pose2D], Pose2D] | None = None,
+        seen: Callable[[Pose2D], dict[str, float | bool]] | None = None,
     ) -> None:
+        self.seen = seen
+        self.readings = ReadingCache(space="s", agent="a", own=["room"], named=[("room", "positions")])
         self.fixture = ControllerFixture(base=BASE)
         self.pose = Pose2D(0.0, 0.0, 0.0)
         self.stopping = threading.Event()
@@ -179,7 +276,10 @@ class MobileRobot:
             controller=self.fixture.controller,
             own_readings=lambda: {"odometry": Reading(asdict(observed(self.pose) if observed else self.pose), 0.0)},
             obstacle_map=lambda: obstacle_map,
+            readings=self.readings,
+            name="qbo",
         )
+        self.publish()
         self.api = RobotApi(context)
         self.api.reserve(1, lambda _: None)
         self.thread = threading.Thread(target=self.run, daemon=True)
@@ -197,6 +297,15 @@ class MobileRobot:
         while not self.stopping.wait(PERIOD_S):
             self.fixture.now_s += PERIOD_S
             self.pose = moved(self.pose, self.fixture.controller.update(self.fixture.now_s).twist, PERIOD_S)
+            self.publish()
+
+    def publish(self) -> None:
+        """Publish the position by the room."""
+        if self.seen is not None:
+            tick_ms = round(self.fixture.now_s * 1000)
+            values = self.seen(self.pose)
+            measured = Measurements(tick_ms=tick_ms, at_ms=0, sequence=tick_ms, values=values)
+            self.readings.record("room", "positions", measured)
 
 
 @pytest.mark.slow
@@ -226,6 +335,21 @@ def test_go_to_corrects_the_pose_at_rest_and_fails_if_the_robot_is_not_at_the_go
         else:
             with refuses("not_arrived"):
                 robot.api.execute(GoTo(x_m=0.3, y_m=0.0))
+
+
+@pytest.mark.parametrize(("seen_age_s", "code"), [(0.0, "position_conflict"), (16.0, "no_position")])
+def test_go_to_does_not_report_the_arrival_of_a_robot_that_only_its_wheels_report(seen_age_s: float, code: str) -> None:
+    def seen(pose: Pose2D) -> dict[str, float | bool]:
+        """The robot is blocked at 0.1 m, where the room sees it or has lost it, and its wheels slip."""
+        blocked = pose.x_m > 0.1
+        return {"x_m.qbo": min(pose.x_m, 0.1), "y_m.qbo": pose.y_m, "age_s.qbo": seen_age_s if blocked else 0.0}
+
+    with MobileRobot(room(), seen=seen) as robot:
+        with refuses(code):
+            robot.api.execute(GoTo(x_m=0.6, y_m=0.0))
+        x_m = robot.pose.x_m
+        eventually(lambda: not robot.fixture.controller.moving)
+        assert robot.pose.x_m - x_m < 0.08, "it brakes at once; the last drive would last 0.3 s"
 
 
 def test_arrival_at_rest_is_measured_against_position_and_heading() -> None:

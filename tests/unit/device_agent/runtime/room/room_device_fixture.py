@@ -8,9 +8,10 @@ from typing import Any
 from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.sensor import Capture, Frame, SensorError
 from device_agent.ports.uploads import UploadError
-from device_agent.protocol import Measurements, Stream, topics
+from device_agent.protocol import CameraStream, Measurements, Stream, topics
 from device_agent.protocol.manifests.room import Control as RoomControl
 from device_agent.protocol.manifests.room import RoomDeviceManifest
+from device_agent.runtime.recording.recorder import Recorder
 from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.runtime.supervision import Supervisor
 from tests.harness.agent.device_harness import DeviceHarness, eventually
@@ -22,7 +23,7 @@ ENTRY = RoomDeviceManifest(
     label="Window",
     driver="fake",
     streams=(Stream(name="air", rate_hz=20.0), Stream(name="rain", rate_hz=5.0)),
-    cameras=(Stream(name="garden", rate_hz=20.0),),
+    cameras=(CameraStream(name="garden", rate_hz=20.0),),
     captures=("image",),
     controls=(RoomControl(name="opening", label="Opening", unit="m", lower=0.0, upper=0.5),),
     position_m=(1.0, -2.0, 1.5),
@@ -41,6 +42,7 @@ class FakeSensor:
         self.holds = 0
         self.closed = False
         self.picture = JPEG
+        self.frame_kind = "colour"
         self.values: dict[str, float | bool] = {}
 
     def connect(self) -> None:
@@ -53,7 +55,7 @@ class FakeSensor:
 
     def frame(self, _camera: str) -> Frame | None:
         self._check()
-        return None if not self.picture else Frame(4, 3, self.picture, time.monotonic())
+        return None if not self.picture else Frame(4, 3, self.picture, time.monotonic(), self.frame_kind)
 
     def capture(self, _name: str) -> Capture:
         self._check()
@@ -113,12 +115,20 @@ class RoomDeviceHarness(DeviceHarness):
         broken: str = "",
         sensor: FakeSensor | None = None,
         supervisor: Supervisor | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
         self.sensor, self.uploads = sensor or FakeSensor(), FakeUploads()
         self.sensor.broken = broken
         self.room_device = RoomDevice(self.sensor, entry, self.uploads if uploads else None)
         driver: Any = self.room_device
-        super().__init__(folder, driver=driver, kind=entry.robot_type(), interlocks=interlocks, supervisor=supervisor)
+        super().__init__(
+            folder,
+            driver=driver,
+            kind=entry.robot_type(),
+            interlocks=interlocks,
+            supervisor=supervisor,
+            recorder=recorder,
+        )
         self.last_epoch = 0
 
     def command(self, request: Any, *, epoch: int | None = None, **fields: Any) -> str:

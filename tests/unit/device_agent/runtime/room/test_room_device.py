@@ -4,9 +4,11 @@ import math
 from unittest import mock
 
 import pytest
+from msgspec.structs import replace
 
 from device_agent.ports.sensor import RoomDriver
-from device_agent.protocol import Control, Description, camera_frames, topics
+from device_agent.protocol import CameraStream, Control, Description, camera_frames, topics
+from device_agent.protocol.manifests.room import Watch
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.runtime.telemetry import device_publisher, rate_meter
@@ -16,6 +18,7 @@ from tests.unit.device_agent.runtime.room.conftest import MakeRoomDevice
 from tests.unit.device_agent.runtime.room.room_device_fixture import (
     ENTRY,
     JPEG,
+    FakeSensor,
     ReducibleSensor,
     RoomDeviceHarness,
     await_growth,
@@ -53,13 +56,28 @@ def test_frames_have_a_header_and_are_not_stored(harness: RoomDeviceHarness) -> 
     await_growth(harness.pictures)
     published = [camera_frames.decode(picture) for picture in harness.pictures()]
     assert [each.sequence for each in published] == list(range(1, len(published) + 1))
-    assert all((each.width, each.height, each.jpeg) == (4, 3, JPEG) for each in published)
+    assert all((each.width, each.height, each.content) == (4, 3, JPEG) for each in published)
     assert not any(topics.CAM in item.topic for item in harness.outbox._incoming)
     harness.sensor.picture = b""
     await_growth(harness.measured)
     count = len(harness.pictures())
     await_growth(harness.measured)
     assert len(harness.pictures()) <= count + 1, "one frame may have been in flight"
+
+
+def test_frames_keep_their_kind_and_are_reduced_and_watched_like_pictures(make_room_device: MakeRoomDevice) -> None:
+    sensor = FakeSensor()
+    sensor.frame_kind, sensor.picture = "people", b'{"people":[]}'
+    stream = CameraStream(name="garden", rate_hz=20.0, kind="people")
+    watch = (Watch(source="garden", stuck_s=0.2),)
+    harness = make_room_device(sensor=sensor, entry=replace(ENTRY, cameras=(stream,), watch=watch))
+    described: Description = eventually(lambda: harness.published(topics.DESC, Description))[-1]
+    assert described.cameras == (stream,)
+    await_growth(harness.pictures)
+    assert {camera_frames.decode(each).kind for each in harness.pictures()} == {"people"}
+    wait_for_state(harness, lambda state: any(fault.code == "stuck.garden" for fault in state.faults))
+    raise_level(harness.load, 1)
+    assert harness.room_device.rate_hz("garden") == 5.0
 
 
 def test_measurements_are_available_to_other_devices_and_repeated_stops_close_the_driver(

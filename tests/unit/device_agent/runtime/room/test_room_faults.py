@@ -1,13 +1,14 @@
 """Stop, interlocks and faults of room devices."""
 
+import threading
 from unittest import mock
 
 import msgspec
 import pytest
 
 from device_agent.config.interlock_rule import InterlockRule
-from device_agent.ports.sensor import SensorError
-from device_agent.protocol import CollectData, Mode, ResetStop, SetControl, StopDevice, TakePicture
+from device_agent.ports.sensor import Frame, SensorError
+from device_agent.protocol import CollectData, Mode, ResetStop, SetControl, StopDevice, TakePicture, camera_frames
 from device_agent.protocol.codec import MAX_BYTES
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.manifests.room import Watch
@@ -17,7 +18,7 @@ from device_agent.runtime.supervision import Supervisor
 from tests.harness.agent.device_harness import eventually, wait_for_state
 from tests.harness.agent.thread_crashes import crash
 from tests.unit.device_agent.runtime.room.conftest import MakeRoomDevice
-from tests.unit.device_agent.runtime.room.room_device_fixture import ENTRY, RoomDeviceHarness, await_growth
+from tests.unit.device_agent.runtime.room.room_device_fixture import ENTRY, FakeSensor, RoomDeviceHarness, await_growth
 
 SET = SetControl(control="opening", value=0.1)
 
@@ -52,6 +53,41 @@ def test_a_sensor_error_is_a_fault_until_the_sensor_responds(make_room_device: M
     harness.sensor.broken = ""
     wait_for_state(harness, lambda state: not state.faults)
     harness.done(TakePicture())
+
+
+def test_a_sensor_that_takes_long_to_connect_is_a_fault_and_does_not_delay_the_start(
+    make_room_device: MakeRoomDevice,
+) -> None:
+    sensor, responds = FakeSensor(), threading.Event()
+    with mock.patch.object(sensor, "connect", responds.wait):
+        harness = make_room_device(sensor=sensor)
+        state = wait_for_state(harness, lambda state: state.faults)
+        assert (state.mode, state.faults[0].message) == (Mode.FAULT, "The device has not responded yet.")
+        assert sensor.reads == {"air": 0, "rain": 0}
+        responds.set()
+        wait_for_state(harness, lambda state: not state.faults)
+    await_growth(harness.measured)
+
+
+def test_a_failed_sensor_has_a_fault_when_the_start_has_ended(make_room_device: MakeRoomDevice) -> None:
+    for _ in range(20):
+        harness = make_room_device(broken="not connected")
+        assert harness.device._controller.fault == "not connected"
+
+
+def test_a_frame_of_another_kind_than_the_manifest_declares_is_a_fault(harness: RoomDeviceHarness) -> None:
+    frame = Frame(4, 3, b"{}", 0.0, camera_frames.SCAN)
+    with mock.patch.object(harness.sensor, "frame", return_value=frame):
+        message = wait_for_state(harness, lambda state: state.faults).faults[0].message
+    assert message == "garden: the manifest declares the kind 'colour', but the driver sends 'scan'; correct the kind"
+
+
+def test_an_unexpected_error_while_the_sensor_connects_is_a_fault(make_room_device: MakeRoomDevice) -> None:
+    sensor = FakeSensor()
+    with mock.patch.object(sensor, "connect", side_effect=ZeroDivisionError):
+        harness = make_room_device(sensor=sensor)
+        assert wait_for_state(harness, lambda state: state.faults).faults[0].message == INTERNAL_ERROR
+    wait_for_state(harness, lambda state: not state.faults)
 
 
 def test_a_sensor_that_fails_after_each_reconnection_is_one_fault_event_and_log_line(

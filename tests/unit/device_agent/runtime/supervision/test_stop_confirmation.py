@@ -9,7 +9,7 @@ from device_agent.protocol import AckStatus, Mode, ResetStop, State, StopDevice,
 from tests.fakes.drivers import FakeDriver
 from tests.harness.agent.device_harness import DeviceHarness, eventually, wait_for_state
 from tests.unit.device_agent.runtime.conftest import MakeDevice
-from tests.unit.device_agent.runtime.test_device import grant
+from tests.unit.device_agent.runtime.device.test_device import grant
 
 
 class HangingDriver(FakeDriver):

@@ -16,8 +16,8 @@ from device_agent.runtime.supervision import Supervisor
 from tests.harness.agent.device_harness import DeviceHarness, eventually, wait_for_state
 from tests.harness.agent.thread_crashes import InjectedCrash, crash
 from tests.unit.device_agent.runtime.conftest import MakeDevice
+from tests.unit.device_agent.runtime.device.test_device import grant
 from tests.unit.device_agent.runtime.supervision.test_stop_confirmation import HangingDriver
-from tests.unit.device_agent.runtime.test_device import grant
 
 MOVE = MoveJoints(position_rad={"elbow": 2.5}, speed=0.1)
 
@@ -170,7 +170,12 @@ def test_a_crashed_task_is_reported_once_and_its_fault_ends(setup: Setup) -> Non
     task = SupervisedThread(fail, name="task", part="upload", device="arm")
     task.start()
     task.join(10)
-    setup.state("agent.upload")
+
+    def shown() -> bool:  # In one state at least: the fault ends at once.
+        states = setup.harness.published(topics.STATE, State)
+        return any(fault.code == "agent.upload" for state in states for fault in state.faults)
+
+    setup.supervise(shown)
     wait_for_state(setup.harness, lambda state: state.faults == ())
     assert len(setup.harness.events(EventKind.PART_FAILED)) == 1
     assert setup.harness.events(EventKind.PART_RECOVERED) == []

@@ -25,7 +25,7 @@ from device_agent.protocol import (
     codec,
 )
 from device_agent.protocol.camera_frames import CameraFrame, decode
-from device_agent.protocol.description import Stream
+from device_agent.protocol.description import CameraStream
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
@@ -39,7 +39,7 @@ from device_agent.runtime.telemetry.rate_meter import WINDOW_S
 from tests.harness.paths import ROBOTS
 
 CONTROLS = (Control(name="pan", label="Pan", lower=-1.0, upper=1.0),)
-CAMERAS = (Stream(name="front", rate_hz=10.0),)
+CAMERAS = (CameraStream(name="front", rate_hz=10.0),)
 EXPRESSIONS = cast("Any", {"smile": None})  # only the names are published
 NAO = msgspec.structs.replace(robot_type.load(ROBOTS / "nao"), cameras=CAMERAS, expressions=EXPRESSIONS)
 BASE = "ts/v1/s/a/arm/"
@@ -59,7 +59,7 @@ SNAPSHOT = StateSnapshot(
 )
 TWIN = Twin(device="arm", bodies=())
 MEASURED = Measurements(sequence=1, at_ms=9, tick_ms=1, values={"temperature_c": 20.0})
-FRAME = CameraFrame(sequence=1, tick_ms=2, width=3, height=4, jpeg=b"jpeg")
+FRAME = CameraFrame(sequence=1, tick_ms=2, width=3, height=4, content=b"jpeg")
 Sent = tuple[str, bytes, dict[str, Any]]
 
 

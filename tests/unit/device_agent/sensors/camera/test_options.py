@@ -26,6 +26,7 @@ from tests.harness.network.cameras.steps import CreateDriver, entry, failure, ne
         ("rtsp", {"url": "rtsp://host/live", "rate_hz": 50}, "rate_hz"),
         ("rtsp", {"url": "rtsp://host/live", "stale_s": 0}, "stale_s"),
         ("v4l2", {"device": "video0"}, "device"),
+        ("mjpeg", {"url": "http://host/x", "password_file": "~no-such-user/x"}, "option 'password_file': the user"),
         ("v4l2", {"url": "rtsp://host/live"}, "driver 'v4l2' has no option 'url'; it has: "),
         ("lens", {}, "no sensor driver 'lens'; there are: mjpeg, "),
     ],

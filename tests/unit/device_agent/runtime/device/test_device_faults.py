@@ -77,6 +77,19 @@ def test_an_unexpected_error_in_the_control_loop_is_a_fault(harness: DeviceHarne
     eventually(lambda: harness.telemetry().mode is Mode.IDLE and harness.device._controller.fault is None)
 
 
+def test_an_unexpected_error_of_a_reconnection_does_not_end_the_control_loop(harness: DeviceHarness) -> None:
+    failed: list[object] = []
+
+    def connect() -> None:
+        failed.append(None)
+        raise ZeroDivisionError("a bug")
+
+    with mock.patch.object(harness.driver, "observe", broken), mock.patch.object(harness.driver, "connect", connect):
+        eventually(lambda: len(failed) >= 2)
+        assert harness.device._controller.fault == INTERNAL_ERROR
+    eventually(lambda: harness.telemetry().mode is Mode.IDLE and harness.device._controller.fault is None)
+
+
 def test_a_recurring_error_of_the_control_loop_is_logged_once(
     harness: DeviceHarness, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -62,6 +62,21 @@ def test_grant_and_end_of_a_lease_are_events_but_renewal_is_not(harness: DeviceH
     assert "expired" in ended.message
 
 
+def test_the_moving_time_of_operator_and_machine_is_an_event_of_the_lease(harness: DeviceHarness) -> None:
+    harness.done(MoveJoints(position_rad={"elbow": 0.5}), epoch=1)
+    machine = event(harness, EventKind.ACTIVITY).data
+    assert (machine["epoch"], machine["operator_s"], machine["first_input_s"]) == (1, 0.0, None)
+    assert machine["machine_s"] > 0.1
+    grant(harness, 2)
+    for sequence in range(1, 10):
+        harness.setpoint(2, sequence)
+        time.sleep(0.02)
+    harness.done(ReleaseLease(), epoch=2)
+    operator = eventually(lambda: [each for each in harness.events(EventKind.ACTIVITY) if each.data["epoch"] == 2])
+    assert operator[-1].data["operator_s"] > 0.05
+    assert operator[-1].data["first_input_s"] >= 0
+
+
 def test_a_stop_in_motion_records_its_effects_once(harness: DeviceHarness) -> None:
     grant(harness)
     harness.done(ResetStop(), epoch=2)

@@ -109,7 +109,7 @@ def test_a_viewer_receives_pictures_and_the_fault_of_a_frozen_camera(
                 frames = viewer.wait_for_frames(device, 3)
                 assert [frame.sequence for frame in frames] == sorted({frame.sequence for frame in frames})
                 assert [frame.tick_ms for frame in frames] == sorted({frame.tick_ms for frame in frames})
-                assert simplejpeg.decode_jpeg(frames[-1].jpeg).shape == (HEIGHT, WIDTH, 3)
+                assert simplejpeg.decode_jpeg(frames[-1].content).shape == (HEIGHT, WIDTH, 3)
             device = anna.get(f"/devices/{ids['mjpeg']}").json()
             assert (device["online"], device["robot_type"], device["kind"]) == (True, "camera", "camera")
 
@@ -117,6 +117,8 @@ def test_a_viewer_receives_pictures_and_the_fault_of_a_frozen_camera(
             action = anna.start(ids["mjpeg"], request=request, wait_ms=30_000, wait_for="done").json()
             assert action["result"]["media_type"] == "image/jpeg", action
 
+            # A camera that needs more than two seconds to connect shows a fault until then.
+            wait_until(lambda: not viewer.faults("rtsp"), "the camera without a fault")
             mjpeg.frozen.set()
             wait_until(lambda: "no new picture" in viewer.faults("mjpeg"), "the fault of the frozen camera")
             viewer.frames("mjpeg").clear()
