@@ -9,23 +9,15 @@ import shutil
 import ssl
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from function_app.adapters.local.blobs import FileBlobs
-from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
-from function_app.adapters.local.certificates import FileCertificates, NoCertificates
 from function_app.adapters.local.clock import SystemClock
-from function_app.adapters.local.command_bus import MqttCommandBus
-from function_app.adapters.local.device_feed import MqttDeviceFeed, MqttTelemetryFeed
-from function_app.adapters.local.monitoring.storage_use import StorageUse
 from function_app.adapters.local.password_hasher import Argon2Hashes
 from function_app.adapters.local.robot_catalogue import FolderCatalogue
-from function_app.adapters.local.signing_keys import FileKeys
-from function_app.adapters.local.table_file import FILE_NAME
-from function_app.adapters.mqtt.connection import Broker
-from function_app.adapters.mqtt.tls import client_context
 from function_app.adapters.shared.key_ring_keys import RingKeys
 from function_app.adapters.shared.vault_keys import VaultKeys
-from function_app.ports.blobs import Blobs, Transfers
+from function_app.ports.blobs import Blobs, Transfers, origin_of
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
@@ -37,6 +29,9 @@ from function_app.ports.password_hasher import PasswordHasher
 from function_app.ports.robot_catalogue import RobotCatalogue
 from function_app.ports.tables import StoreError, Tables
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, KeyVault, SecretsManager, Settings
+
+if TYPE_CHECKING:
+    from function_app.adapters.mqtt.connection import Broker
 
 BLOBS_PATH = "/api/v1/blobs"
 """Path of presigned URLs of ``FileBlobs``."""
@@ -95,12 +90,19 @@ def adapters(settings: Settings, clock: Clock) -> Adapters:
         password_hashes=Argon2Hashes(),
         catalogue=FolderCatalogue(settings.robots),
         free_bytes=lambda: _least(free_bytes(settings), tables.left_bytes()),
-        stored_bytes=StorageUse(settings.home / FILE_NAME, settings.home / "blobs").read
-        if settings.store is None
-        else dict,
+        stored_bytes=_stored_bytes(settings),
         metrics=metrics(),
         tracing=tracing(settings),
     )
+
+
+def _stored_bytes(settings: Settings) -> Callable[[], dict[str, int]]:
+    if settings.store is not None:
+        return dict
+    from function_app.adapters.local.monitoring.storage_use import StorageUse  # noqa: PLC0415
+    from function_app.adapters.local.table_file import FILE_NAME  # noqa: PLC0415
+
+    return StorageUse(settings.home / FILE_NAME, settings.home / "blobs").read
 
 
 def metrics() -> Metrics:
@@ -160,6 +162,8 @@ def keys(settings: Settings, now_ms: Callable[[], int]) -> RingKeys:
                 now_ms=now_ms,
             )
         case None:
+            from function_app.adapters.local.signing_keys import FileKeys  # noqa: PLC0415
+
             file_keys = FileKeys(settings.home / "keys", now_ms=now_ms)
             file_keys.load()
             return file_keys
@@ -198,6 +202,7 @@ def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables,
                 S3Blobs(bucket=aws.bucket, region=aws.region, endpoint=aws.endpoint),
             )
         case None:
+            from function_app.adapters.local.table_file import FILE_NAME  # noqa: PLC0415
             from function_app.adapters.local.tables import SqliteTables  # noqa: PLC0415
 
             max_bytes = settings.storage_limits.max_tables_mb * 1_000_000
@@ -216,6 +221,8 @@ def access(
         return IotBrokerAccess(keys=signing, tables=tables, region=iot.region, endpoint=iot.endpoint)
     if settings.broker == "eventgrid":
         return _event_grid(settings, signing, tables)
+    from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess  # noqa: PLC0415
+
     if settings.broker == "amqtt":
         return TokenBrokerAccess(signer=signing.signer, publish=publish)
     return MosquittoBrokerAccess(
@@ -231,6 +238,7 @@ def _event_grid(settings: Settings, signing: RingKeys, tables: Tables) -> Broker
     from function_app.adapters.azure.broker_access import EventGridBrokerAccess  # noqa: PLC0415 (only where in use)
     from function_app.adapters.azure.session_takeover import SessionTakeover  # noqa: PLC0415
     from function_app.adapters.azure.webhook_auth import EntraTokenVerifier  # noqa: PLC0415
+    from function_app.adapters.mqtt.tls import client_context  # noqa: PLC0415
 
     grid = settings.bus
     assert isinstance(grid, EventGridBus)  # noqa: S101 (validated by the settings)
@@ -254,11 +262,15 @@ def bus(settings: Settings, broker_access: BrokerAccess) -> CommandBus:
 
             return EventGridCommandBus(endpoint=grid.endpoint, identity=grid.identity)
         case None:
+            from function_app.adapters.local.command_bus import MqttCommandBus  # noqa: PLC0415
+
             return MqttCommandBus(_broker(settings, broker_access))
 
 
 def feeds(settings: Settings, broker_access: BrokerAccess) -> tuple[DeviceFeed, TelemetryFeed, TelemetryFeed]:
     """The feeds of device messages, of telemetry, and of telemetry that was recorded during a disconnection."""
+    from function_app.adapters.local.device_feed import MqttDeviceFeed, MqttTelemetryFeed  # noqa: PLC0415
+
     broker = _broker(settings, broker_access)
     return MqttDeviceFeed(broker), MqttTelemetryFeed(broker), MqttTelemetryFeed(broker, late=True)
 
@@ -271,6 +283,8 @@ def certificates(settings: Settings) -> Certificates:
         iot = settings.bus
         assert isinstance(iot, IotBus)  # noqa: S101 (validated by the settings)
         return IotCertificates(region=iot.region, policy=iot.policy)
+    from function_app.adapters.local.certificates import FileCertificates, NoCertificates  # noqa: PLC0415
+
     if settings.tls is None or settings.tls.agents is None:
         return NoCertificates()
     return FileCertificates(settings.tls.agents)
@@ -282,6 +296,8 @@ def broker_tls(settings: Settings) -> ssl.SSLContext | None:
     Raises:
         BrokerAccessError: The certificate of the authority cannot be read.
     """
+    from function_app.adapters.mqtt.tls import client_context  # noqa: PLC0415
+
     return None if settings.tls is None else client_context(settings.tls.ca, settings.tls.agents)
 
 
@@ -316,15 +332,20 @@ async def prepare(settings: Settings) -> None:
         from function_app.adapters.aws.tables import DynamoTables  # noqa: PLC0415
 
         for store in stores(settings):
-            assert isinstance(store, DynamoTables | S3Blobs)  # noqa: S101 (validated by the settings)
             try:
-                await store.prepare()
+                if isinstance(store, S3Blobs):
+                    await store.prepare(console=origin_of(settings.public_url))
+                else:
+                    assert isinstance(store, DynamoTables)  # noqa: S101 (validated by the settings)
+                    await store.prepare()
             finally:
                 await store.close()
 
 
-def _broker(settings: Settings, broker_access: BrokerAccess) -> Broker:
+def _broker(settings: Settings, broker_access: BrokerAccess) -> "Broker":
     """The broker, with the credentials of the functions."""
+    from function_app.adapters.mqtt.connection import Broker  # noqa: PLC0415
+
     return Broker(
         host=settings.mqtt_host,
         port=settings.mqtt_port,

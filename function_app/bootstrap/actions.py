@@ -1,4 +1,4 @@
-"""Factories of the actions services."""
+"""Factories of the actions services, and of autonomy, which reads actions."""
 
 from functools import cached_property
 
@@ -11,6 +11,11 @@ from function_app.services.actions.queue import ActionQueues
 from function_app.services.actions.start import StartAction
 from function_app.services.actions.start_many import StartOnMany
 from function_app.services.actions.stop import StopDevices
+from function_app.services.actions.tasks import RobotTypeTasks
+from function_app.services.actions.trial_log import TrialLog
+from function_app.services.autonomy.autonomy_reader import AutonomyReader
+from function_app.services.autonomy.session_actions import SessionActions
+from function_app.services.autonomy.task_reports import TaskReports
 
 
 class ActionServices(ControlServices):
@@ -19,6 +24,28 @@ class ActionServices(ControlServices):
     @cached_property
     def action_store(self) -> ActionStore:
         return ActionStore(tables=self.tables, metrics=self.metrics)
+
+    @cached_property
+    def autonomy(self) -> AutonomyReader:
+        return AutonomyReader(
+            session_log=self.sessions_of_devices, recordings=self.recordings, action_store=self.action_store
+        )
+
+    @cached_property
+    def session_actions(self) -> SessionActions:
+        return SessionActions(session_log=self.sessions_of_devices)
+
+    @cached_property
+    def tasks(self) -> RobotTypeTasks:
+        return RobotTypeTasks(robot_types=self.robot_types)
+
+    @cached_property
+    def trial_log(self) -> TrialLog:
+        return TrialLog(tables=self.tables, retention=self.retention, clock=self.clock)
+
+    @cached_property
+    def task_reports(self) -> TaskReports:
+        return TaskReports(trial_log=self.trial_log, devices=self.devices, tasks=self.tasks)
 
     @cached_property
     def dispatcher(self) -> ActionDispatcher:
@@ -39,6 +66,7 @@ class ActionServices(ControlServices):
             reminders=self.reminders,
             dispatcher=self.dispatcher,
             control_events=self.control_events,
+            trial_log=self.trial_log,
             clock=self.clock,
         )
 
@@ -60,6 +88,7 @@ class ActionServices(ControlServices):
             tables=self.tables,
             devices=self.devices,
             movements=self.movements,
+            tasks=self.tasks,
             command_sender=self.command_sender,
             action_store=self.action_store,
             acks=self.action_acks,

@@ -19,6 +19,7 @@ class ControlServices(MessagingServices):
         return ControlEvents(
             tables=self.tables,
             events=self.events,
+            sessions=self.sessions_of_devices,
             audit_log=self.audit_log,
             reminders=self.reminders,
             metrics=self.metrics,

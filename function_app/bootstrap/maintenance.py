@@ -29,6 +29,8 @@ class MaintenanceServices(AccountServices):
             invitations=self.invitations,
             api_keys=self.api_keys,
             control_events=self.control_events,
+            session_actions=self.session_actions,
+            trial_log=self.trial_log,
             audit_log=self.audit_log,
             access=self.access,
             retention=self.retention,

@@ -4,6 +4,7 @@ from functools import cached_property
 
 from function_app.bootstrap.health import HealthServices
 from function_app.services.messaging.broker_relay import BrokerRelay
+from function_app.services.messaging.camera_consents import CameraConsents
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.messaging.confirmations import Confirmations
 from function_app.services.messaging.delivery import Delivery
@@ -57,12 +58,24 @@ class MessagingServices(HealthServices):
         return CommandPolling(tables=self.tables, mailbox=self.mailbox, clock=self.clock)
 
     @cached_property
+    def camera_consents(self) -> CameraConsents:
+        return CameraConsents(
+            tables=self.tables,
+            devices=self.devices,
+            command_sender=self.command_sender,
+            audit_log=self.audit_log,
+            clock=self.clock,
+        )
+
+    @cached_property
     def presence(self) -> PresenceIngest:
         return PresenceIngest(
             tables=self.tables,
             events=self.events,
+            sessions=self.sessions_of_devices,
             audit_log=self.audit_log,
             reported_faults=self.reported_faults,
             key_announcer=KeyAnnouncer(keys=self.keys, command_sender=self.command_sender),
+            camera_consents=self.camera_consents,
             clock=self.clock,
         )

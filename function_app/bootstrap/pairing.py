@@ -25,6 +25,7 @@ class PairingServices(ActionServices):
             certificates=self.certificates,
             bus=self.bus,
             series=self.series_writer,
+            recordings=self.recordings,
             retention=self.retention,
             control_events=self.control_events,
             clock=self.clock,

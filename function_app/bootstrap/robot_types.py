@@ -2,7 +2,6 @@
 
 from functools import cached_property
 
-from function_app.adapters.model_compiler.compiler import MujocoCompiler
 from function_app.bootstrap.telemetry import TelemetryServices
 from function_app.services.robot_types.catalogue import RobotTypes
 from function_app.services.robot_types.delete import RobotTypeDeletion
@@ -79,5 +78,7 @@ class RobotTypeServices(TelemetryServices):
 
     @cached_property
     def model_checks(self) -> ModelValidator:
+        from function_app.adapters.model_compiler.compiler import MujocoCompiler  # noqa: PLC0415 (rarely in use)
+
         compiler = MujocoCompiler(allow_unconfined=self.settings.allow_unconfined_models)
         return ModelValidator(tables=self.tables, blobs=self.blobs, compiler=compiler, clock=self.clock)

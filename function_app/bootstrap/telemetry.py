@@ -7,8 +7,10 @@ from function_app.domain.telemetry.series import RetentionPolicy
 from function_app.services.storage.retention import DAY_MS
 from function_app.services.telemetry.event_log import EventLog
 from function_app.services.telemetry.latency import LatencyStore
+from function_app.services.telemetry.recordings import Recordings
 from function_app.services.telemetry.series_reader import SeriesReader
 from function_app.services.telemetry.series_writer import SeriesWriter
+from function_app.services.telemetry.session_log import SessionLog
 from function_app.services.telemetry.uploads import Uploads
 
 
@@ -18,6 +20,10 @@ class TelemetryServices(DeviceServices):
     @cached_property
     def events(self) -> EventLog:
         return EventLog(tables=self.tables, retention=self.retention, clock=self.clock)
+
+    @cached_property
+    def sessions_of_devices(self) -> SessionLog:
+        return SessionLog(tables=self.tables, retention=self.retention, clock=self.clock)
 
     @cached_property
     def retention_policy(self) -> RetentionPolicy:
@@ -42,6 +48,17 @@ class TelemetryServices(DeviceServices):
             blobs=self.blobs,
             quota=self.quota,
             keep_ms=self.settings.retention.uploads_days * DAY_MS,
+            clock=self.clock,
+        )
+
+    @cached_property
+    def recordings(self) -> Recordings:
+        return Recordings(
+            tables=self.tables,
+            blobs=self.blobs,
+            session_log=self.sessions_of_devices,
+            quota=self.quota,
+            retention=self.retention,
             clock=self.clock,
         )
 

@@ -33,6 +33,7 @@ RELAXED: Final = frozenset(
         "ModelChecks",
         "Pending",
         "Series",
+        "Sessions",
         "Uploads",
         "Usage",
         "Watched",

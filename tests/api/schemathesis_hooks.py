@@ -89,7 +89,8 @@ def map_case(_context: object, case: _Case) -> _Case:
     selector = zlib.crc32(repr((case.path_parameters, case.query, case.body)).encode())
     operation = case.operation.definition.raw["operationId"]
     for name, value in dict(case.path_parameters or {}).items():
-        existing = WORLD["spare_agents"] if operation == "unpair_agent" else WORLD["ids"].get(name, [])
+        ids = WORLD["ids"].get(f"{operation}.{name}", WORLD["ids"].get(name, []))
+        existing = WORLD["spare_agents"] if operation == "unpair_agent" else ids
         if existing and isinstance(value, str) and selector % 8:
             case.path_parameters[name] = existing[selector // 8 % len(existing)]
     for place in (case.query, case.body):

@@ -86,6 +86,9 @@ def create_resources(host: Host, site: Site, anna: Visitor, another: Visitor, ro
             "agent": [robot.id],
             "action": actions,
             "robot_type": ["ur5"],
+            **{f"{name}.robot_type": ["ur5_gripper"] for name in ("get_task", "list_tasks", "list_trials")},
+            "publish_trials.robot_type": ["ur5_gripper"],
+            "task": ["red_cube_in_green_tray"],
             "name": ["mine", "wave"],
             "stream": [each["name"] for each in streams],
             "fault": [each["id"] for each in faults],
@@ -136,7 +139,7 @@ def run(host: Host, home: Path, *options: str) -> None:
 
 @pytest.mark.timeout(300)
 def test_responses_match_the_document(host: Host, home: Path) -> None:
-    run(host, home, "--phases", "examples,coverage,fuzzing", "--max-examples", "12", "--seed", "1")
+    run(host, home, "--phases", "examples,coverage,fuzzing", "--max-examples", "4", "--seed", "1")
 
 
 @pytest.mark.long

@@ -163,7 +163,8 @@ def apply_report(action: Action, report: AckReport) -> Action:
     if report.status is Status.EXPIRED and action.cancel_id:
         reason = {"code": "cancelled", "message": "Cancelled before the device received it."}
         report = replace(report, status=Status.CANCELLED, reason=reason)
-    if report.status.terminal and report.status is not Status.DONE and is_withdrawn(action):
+    by_request = report.status is Status.CANCELLED and action.cancel_id
+    if report.status.terminal and report.status is not Status.DONE and is_withdrawn(action) and not by_request:
         report = replace(report, status=Status.FAILED, reason=action.reason)
     if 0 < report.device_epoch < action.epoch:
         return action  # the rejected command was issued again with a higher epoch
@@ -229,7 +230,8 @@ def end(action: Action, status: Status, code: str, message: str, now_ms: int) ->
 def withdraw(action: Action, code: str, message: str, now_ms: int) -> Action:
     """The action after its account lost the right to run it. It is cancelled at the device, which may have executed it.
 
-    Its outcome is unknown until the device reports: ``done``, or ``failed`` with this reason.
+    Its outcome is unknown until the device reports: ``done``, ``cancelled`` if its caller had cancelled it before, or
+    ``failed`` with this reason.
     """
     return action if action.status is Status.UNKNOWN else end(action, Status.UNKNOWN, code, message, now_ms)
 

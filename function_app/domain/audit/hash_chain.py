@@ -45,6 +45,7 @@ class AccountEvent(StrEnum):
     AGENT_UNPAIRED = "agent-unpaired"
     AGENT_MOVED = "agent-moved"
     DEVICE_RENAMED = "device-renamed"
+    CAMERA_CONSENT_SET = "camera-consent-set"
     SHARED = "shared"
     UNSHARED = "unshared"
     INVITED = "invited"

@@ -86,7 +86,8 @@ def control_ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> Cont
     """The event for control that ended because the device was ``unpaired``, ``moved``, ``removed`` or ``unshared``."""
     how = "is no longer shared with them" if why == "unshared" else f"was {why}"
     message = f"Control of {before.holder} ended: the device {how}."
-    return _of_lease(after, Fact.ENDED, now_ms, message, {"holder": before.holder, "reason": why})
+    data: dict[str, str | int] = {"holder": before.holder, "reason": why, "ended_epoch": before.epoch}
+    return _of_lease(after, Fact.ENDED, now_ms, message, data)
 
 
 def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
@@ -98,7 +99,8 @@ def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> I
     data = {"holder": after.holder} | ({"from": previous} if previous else {})
     request = after.request
     if not after.account:
-        yield _of_lease(after, Fact.RESET_ORDERED, now_ms, f"{by} reset the Stop.", {"caller": by, **data})
+        ended = {"ended_epoch": before.epoch} if before is not None and previous else {}
+        yield _of_lease(after, Fact.RESET_ORDERED, now_ms, f"{by} reset the Stop.", {"caller": by, **data, **ended})
     elif request is not None and request.outcome == "accepted" and request.epoch == after.epoch - 1:
         message = f"{by} handed control over to {after.holder}."
         yield _of_lease(after, Fact.HANDED_OVER, now_ms, message, {"request": request.id, **data})
@@ -131,7 +133,7 @@ def _of_lease(
     fact: Fact,
     at_ms: int,
     message: str,
-    data: Mapping[str, str],
+    data: Mapping[str, str | int],
     *,
     severity: Literal["info", "warning"] = "info",
 ) -> ControlEvent:

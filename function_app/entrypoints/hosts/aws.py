@@ -6,15 +6,16 @@ The loop runs only during an invocation; between invocations the instance is fro
 
 import asyncio
 import functools
-from typing import Any
-
-from mangum import Mangum
+from typing import TYPE_CHECKING, Any
 
 from function_app import bootstrap, settings
 from function_app.bootstrap import Functions
 from function_app.entrypoints.broker_auth.iot_core import authorise
 from function_app.entrypoints.http import create_app
 from function_app.entrypoints.ingest.cloud_events import from_iot_rule, from_queue
+
+if TYPE_CHECKING:
+    from mangum import Mangum
 
 _SCHEDULES = frozenset({"aws.events", "aws.scheduler"})
 """Sources of timer events from EventBridge rules and schedules without custom input."""
@@ -63,5 +64,7 @@ def _functions() -> Functions:
 
 
 @functools.cache
-def _http() -> Mangum:
+def _http() -> "Mangum":
+    from mangum import Mangum  # noqa: PLC0415 (only for HTTP events)
+
     return Mangum(create_app(_functions()), lifespan="off", text_mime_types=list(_TEXT))

@@ -24,9 +24,10 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem, invalid, store_unavailable
 from function_app.entrypoints.http.accounts import api_keys, audit, auth, me, oidc, second_factor
 from function_app.entrypoints.http.actions import actions, many, stop
+from function_app.entrypoints.http.autonomy import autonomy, session_recordings, tasks
 from function_app.entrypoints.http.console import Console
 from function_app.entrypoints.http.control import lease, mqtt_credentials
-from function_app.entrypoints.http.devices import devices
+from function_app.entrypoints.http.devices import camera_consent, devices
 from function_app.entrypoints.http.framework.api_reference import reference
 from function_app.entrypoints.http.framework.authentication import COOKIE, RequestAuthenticator, is_stop
 from function_app.entrypoints.http.framework.client_address import client_address
@@ -53,7 +54,7 @@ from function_app.entrypoints.http.robot_types import (
     script_editor,
 )
 from function_app.entrypoints.http.sharing import routes as sharing
-from function_app.entrypoints.http.telemetry import blob_transfers, events, latency, series, uploads
+from function_app.entrypoints.http.telemetry import blob_transfers, events, latency, recordings, series, uploads
 from function_app.ports.clock import Clock
 from function_app.ports.monitoring import Histogram, Metrics
 from function_app.ports.tables import StoreError, StoreFullError
@@ -62,10 +63,10 @@ from function_app.services.identity.rate_limiter import RateLimiter
 _SECURE_FOR = b"max-age=31536000"
 """One year [s]: browsers that used TLS once use only TLS."""
 _MODULES = (
-    auth, me, second_factor, oidc, api_keys, agents, polling, audit, devices, device_library, sharing, lease, stop,
-    actions, many, robot_types, agent_packages, previews, movements, script_editor, mqtt_credentials, xmpp, latency,
-    faults, events,
-    diagnostics, series, uploads, health_check, administration,
+    auth, me, second_factor, oidc, api_keys, agents, polling, audit, devices, device_library, camera_consent, sharing,
+    lease, stop, actions, many, autonomy, tasks, session_recordings, recordings,
+    robot_types, agent_packages, previews, movements, script_editor, mqtt_credentials, xmpp,
+    latency, faults, events, diagnostics, series, uploads, health_check, administration,
 )  # fmt: skip
 """In the order of the OpenAPI document."""
 _log = logging.getLogger(__name__)
@@ -123,7 +124,11 @@ def create_app(functions: Functions) -> FastAPI:
         _Headers,
         clock=functions.clock,
         metrics=functions.metrics,
-        websocket_urls=(functions.settings.websocket_url, functions.settings.xmpp.websocket_url),
+        servers=(
+            functions.settings.websocket_url.partition("?")[0],
+            functions.settings.xmpp.websocket_url.partition("?")[0],
+            functions.blobs.origin,
+        ),
         secure=_requires_hsts(functions.settings.public_url),
     )
     if functions.tracing.enabled:
@@ -235,16 +240,15 @@ class _Addresses:
 class _Headers:
     """Adds headers to every response, and returns a 500 response for unhandled errors. Plain ASGI, for speed."""
 
-    def __init__(
-        self, app: ASGIApp, *, clock: Clock, metrics: Metrics, websocket_urls: tuple[str, ...], secure: bool
-    ) -> None:
+    def __init__(self, app: ASGIApp, *, clock: Clock, metrics: Metrics, servers: tuple[str, ...], secure: bool) -> None:
+        """``servers``: to which the console connects, besides this one."""
         self._app = app
         self._clock = clock
         self._metrics = metrics
-        servers = " ".join(url.partition("?")[0] for url in websocket_urls if url)
+        connected = " ".join(("'self'", *filter(None, servers)))
         policy = (
             "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; font-src 'self'; "
-            f"connect-src 'self' {servers}; base-uri 'none'; form-action 'none'; "
+            f"connect-src {connected}; base-uri 'none'; form-action 'none'; "
             "frame-ancestors 'none'"
         )
         self._fixed = [

@@ -56,7 +56,7 @@ class ActionAcks:
         self._tracing = tracing
         self._clock = clock
 
-    async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
+    async def ingest(self, topic: Topic, payload: bytes, *, by: Transport) -> None:
         """Apply an ack received on ``topic``. Duplicate and late acks have no effect.
 
         Raises:

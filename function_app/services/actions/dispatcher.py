@@ -2,7 +2,7 @@
 
 import msgspec
 
-from device_agent.protocol import RunMovement, Task
+from device_agent.protocol import RunMovement, RunTrial, Task
 from function_app.domain.actions.action import ASK_MS, KEY_ENDED, SIGNED_OUT, UNSHARED, Action, mark_published
 from function_app.domain.actions.queue import DROPPED, UNPAIRED
 from function_app.domain.common.ids import split_command, split_device
@@ -13,6 +13,7 @@ from function_app.domain.identity.api_keys import key_of
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.actions.action_store import ActionStore, StoredAction
+from function_app.services.actions.trial_log import KIND
 from function_app.services.devices.device_access import DeviceAccess, devices_of, require_online
 from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.robot_types.movements import Movements
@@ -112,18 +113,27 @@ class ActionDispatcher:
         command = await self._command(action)
         await self._command_sender.send_action(device, command, action, until_ms=now_ms + ASK_MS)
 
-    async def _command(self, action: Action) -> Task | RunMovement:
-        if action.request["kind"] != "run_movement":
-            task: Task = msgspec.convert(action.request, Task)
-            return task
+    async def _command(self, action: Action) -> Task | RunMovement | RunTrial:
+        request = action.request
+        if request["kind"] == "run_movement":
+            return await self._movement(action, request["name"])
+        if request["kind"] == KIND:
+            movement = await self._movement(action, request["movement"])
+            return RunTrial(
+                name=request["name"], tasks_sha256=request["tasks_sha256"], seed=request["seed"], movement=movement
+            )
+        task: Task = msgspec.convert(request, Task)
+        return task
+
+    async def _movement(self, action: Action, name: str) -> RunMovement:
         # A shared device runs its owner's movements, so the author's store contains the script.
         owner = Identity(action.pinned["author"] or action.account, action.caller, "")
-        source = await self._movements.pinned_source(owner, action.request["name"], action.pinned)
+        source = await self._movements.pinned_source(owner, name, action.pinned)
         if source is None:
             raise MovementUnavailable
         return RunMovement(
             **action.pinned,
-            name=action.request["name"],
+            name=name,
             source=source,
             parameters=action.request["parameters"],
             timeout_ms=action.timeout_ms,

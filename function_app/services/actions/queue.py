@@ -22,6 +22,7 @@ from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.actions.action_store import ActionStore, StoredAction
 from function_app.services.actions.dispatcher import ActionDispatcher, MovementUnavailable, PermissionEnded
+from function_app.services.actions.trial_log import TrialLog
 from function_app.services.control.control_events import ControlEvents, lease_change
 from function_app.services.devices.control_rows import apply_device_epochs, read_control, read_control_rows
 from function_app.services.storage import records
@@ -47,6 +48,7 @@ class ActionQueues:
         reminders: Reminders,
         dispatcher: ActionDispatcher,
         control_events: ControlEvents,
+        trial_log: TrialLog,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -54,13 +56,16 @@ class ActionQueues:
         self._reminders = reminders
         self._dispatcher = dispatcher
         self._control_events = control_events
+        self._trial_log = trial_log
         self._clock = clock
 
     async def change(
         self, action: str, change: Callable[[Action], Action], *, existing: StoredAction | None = None
     ) -> StoredAction | None:
-        """Like ``ActionStore.change``; then advance the queue if other actions are queued. Raises ``busy``."""
+        """Like ``ActionStore.change``; then record the end of a trial, and advance the queue. Raises ``busy``."""
         stored = await self._action_store.change(action, change, existing=existing)
+        if stored is not None and (stored.action.status.terminal or stored.action.status is Status.UNKNOWN):
+            await self._trial_log.record(stored.action)
         if stored is not None and stored.waited_for:
             await self.advance(stored.action.device)
         return stored

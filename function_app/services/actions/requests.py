@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 import msgspec
 from msgspec import Meta, Struct
 
-from device_agent.protocol import Id, Task
+from device_agent.protocol import MAX_SEED, Id, Task
 
 
 class AskMovement(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="run_movement"):
@@ -14,6 +14,17 @@ class AskMovement(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True,
 
     name: Id
     parameters: dict[str, Any] = {}
+
+
+class AskTrial(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="run_trial"):
+    """Run one trial of a task of the device's robot type: reset the objects, run the movement, observe the condition.
+
+    ``seed``: seed of the reset; null: a random one if the task is observed in a simulation, otherwise no reset. The
+    verdict is the entry ``trial`` of the action's result.
+    """
+
+    name: Id
+    seed: Annotated[int, Meta(ge=0, le=MAX_SEED)] | None = None
 
 
 def _strict(kind: type[Struct]) -> type[Struct]:  # pragma: no mutate block (runs at import)
@@ -45,7 +56,7 @@ class ActionOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     ``ttl_ms`` and ``timeout_ms`` count from the moment the action leaves the queue.
     """
 
-    request: AskMovement | _StrictTask
+    request: AskMovement | AskTrial | _StrictTask
     policy: Literal["reject", "queue"] = "reject"
     queue_ms: Annotated[int, Meta(ge=1_000, le=86_400_000)] = 300_000
     ttl_ms: Annotated[int, Meta(ge=1, le=86_400_000)] = 10_000

@@ -1,6 +1,7 @@
 """Starts actions: writes action, slot and lease in one batch, publishes the command and waits for the acks."""
 
 import hashlib
+import secrets
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, nullcontext
 from dataclasses import replace
@@ -8,7 +9,8 @@ from typing import Any
 
 import msgspec
 
-from device_agent.protocol import Ack, CollectData, RunMovement, Task
+from device_agent.protocol import MAX_SEED, Ack, CollectData, RunMovement, RunTrial, Task
+from device_agent.protocol.manifests.tasks import Task as SceneTask
 from function_app.domain.actions.action import KEY_ENDED, RETRY_MS, UNSHARED, Action, Status, end, reached
 from function_app.domain.actions.queue import DROPPED
 from function_app.domain.common.ids import command_id
@@ -25,7 +27,8 @@ from function_app.services.actions import capability_check
 from function_app.services.actions.acks import ActionAcks, Publication
 from function_app.services.actions.action_store import ActionStore, StoredAction, new_row
 from function_app.services.actions.queue import ActionQueues, action_lease
-from function_app.services.actions.requests import ActionRequest
+from function_app.services.actions.requests import ActionRequest, AskMovement, AskTrial
+from function_app.services.actions.tasks import RobotTypeTasks
 from function_app.services.control.control_events import ControlEvents, lease_change
 from function_app.services.devices.control_rows import ControlRows, apply_device_epochs, read_control
 from function_app.services.devices.device_access import DeviceAccess, require_online, require_operator
@@ -40,6 +43,9 @@ ABANDON_MS = 30_000
 """A start that is not written after this time is rejected, because its reminder may have been deleted."""
 PINNED = ("robot_type", "version", "sha256", "author", "key", "signature")
 """Fields of the movement that an action stores, so that a republished command is identical."""
+
+TRIAL_MARGIN_S = 15.0
+"""Time for reset and verdict of a trial, in addition to the time limit of its task [s]."""
 
 _Pending = tuple[StoredAction, AsyncIterator[Ack] | None, Publication | None]
 """A stored action, its acks, and the publication of its command if this request published it."""
@@ -62,6 +68,7 @@ class StartAction:
         tables: Tables,
         devices: DeviceAccess,
         movements: Movements,
+        tasks: RobotTypeTasks,
         command_sender: CommandSender,
         action_store: ActionStore,
         acks: ActionAcks,
@@ -75,6 +82,7 @@ class StartAction:
         self._tables = tables
         self._devices = devices
         self._movements = movements
+        self._tasks = tasks
         self._command_sender = command_sender
         self._action_store = action_store
         self._acks = acks
@@ -110,7 +118,7 @@ class StartAction:
                 ``queue-full``, ``lease-held``, ``lease-lost``, ``idempotency-key-reused``, ``busy``,
                 ``parameters-invalid``, ``unable``, ``invalid``.
         """
-        if not isinstance(request.request, Task):
+        if isinstance(request.request, AskMovement):
             parameters.check(request.request.parameters)
         target = Status(request.wait_for)
         async with AsyncExitStack() as stack:
@@ -214,7 +222,7 @@ class StartAction:
 
     async def _task(
         self, device: Device, request: ActionRequest
-    ) -> tuple[RunMovement | Task, dict[str, Any], dict[str, Any]]:
+    ) -> tuple[RunMovement | RunTrial | Task, dict[str, Any], dict[str, Any]]:
         """The task for the device, the request as stored, and the pinned fields of a movement."""
         task = request.request
         stored_request: dict[str, Any] = msgspec.to_builtins(task)
@@ -223,24 +231,43 @@ class StartAction:
                 raise invalid("Collecting data takes longer than timeout_ms. Raise timeout_ms, or lower duration_s.")
             await capability_check.check(self._tables, device, task)
             return task, stored_request, {}
-        # A device runs the movements of its owner only, also when another account starts them.
+        if isinstance(task, AskTrial):
+            trial = await self._trial(device, task, request.timeout_ms)
+            stored_request |= {"seed": trial.seed, "tasks_sha256": trial.tasks_sha256}
+            stored_request |= {"movement": trial.movement.name, "parameters": trial.movement.parameters}
+            return trial, stored_request, _pinned(trial.movement)
+        run = await self._movement(device, task.name, task.parameters, request.timeout_ms)
+        # Stored with the default values: a republished command must be identical.
+        stored_request["parameters"] = run.parameters
+        return run, stored_request, _pinned(run)
+
+    async def _trial(self, device: Device, trial: AskTrial, timeout_ms: int) -> RunTrial:
+        manifest, task = await self._tasks.get(Identity(device.owner, "", ""), device.robot_type, trial.name)
+        needed_ms = round((task.time_limit_s + TRIAL_MARGIN_S) * 1000)
+        if timeout_ms < needed_ms:
+            raise invalid(f"A trial of '{trial.name}' needs a timeout_ms of at least {needed_ms}.")
+        seed = trial.seed
+        if seed is None and isinstance(task, SceneTask) and manifest.objects:
+            seed = secrets.randbelow(MAX_SEED + 1)
+        movement = await self._movement(device, task.movement, task.parameters, timeout_ms)
+        return RunTrial(name=task.name, tasks_sha256=manifest.sha256, seed=seed, movement=movement)
+
+    async def _movement(self, device: Device, name: str, given: dict[str, Any], timeout_ms: int) -> RunMovement:
+        """The newest version of a movement. A device runs those of its owner, also when another account starts them."""
         owner = Identity(device.owner, "", "")
-        movement, source = await self._movements.get(owner, device.robot_type, task.name)
-        run = RunMovement(
+        movement, source = await self._movements.get(owner, device.robot_type, name)
+        return RunMovement(
             robot_type=device.robot_type,
             name=movement.name,
             version=movement.version,
             sha256=movement.sha256,
             source=source,
-            parameters=parameters.fit(movement.parameters_schema, task.parameters),
+            parameters=parameters.fit(movement.parameters_schema, given),
             author=movement.author or device.owner,
             key=movement.key,
             signature=movement.signature,
-            timeout_ms=request.timeout_ms,
+            timeout_ms=timeout_ms,
         )
-        # Stored with the default values: a republished command must be identical.
-        stored_request["parameters"] = run.parameters
-        return run, stored_request, {name: getattr(run, name) for name in PINNED}
 
     async def _write(
         self, caller: Identity, device: Device, draft: Action, request: ActionRequest
@@ -295,6 +322,10 @@ class StartAction:
             detail = "This Idempotency-Key was used with another request. Use a new key for a new request."
             raise Problem("idempotency-key-reused", 422, "The key was used before", detail)
         return await self._action_store.get(row.data["action"])
+
+
+def _pinned(movement: RunMovement) -> dict[str, Any]:
+    return {name: getattr(movement, name) for name in PINNED}
 
 
 def device_busy(action: str) -> Problem:

@@ -25,6 +25,7 @@ from function_app.services.devices.control_rows import read_control_rows
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 from function_app.services.telemetry.event_log import EventLog
+from function_app.services.telemetry.session_log import SessionLog
 
 CHECK_MS: Final = 15_000
 """Delay after which the timer checks a changed lease, in case the process was killed."""
@@ -48,6 +49,7 @@ class ControlEvents:
         *,
         tables: Tables,
         events: EventLog,
+        sessions: SessionLog,
         audit_log: AuditLog,
         reminders: Reminders,
         metrics: Metrics,
@@ -55,6 +57,7 @@ class ControlEvents:
     ) -> None:
         self._tables = tables
         self._events = events
+        self._sessions = sessions
         self._audit_log = audit_log
         self._reminders = reminders
         self._metrics = metrics
@@ -104,6 +107,7 @@ class ControlEvents:
             await records.discard(self._tables, records.CONTROL, row)
 
     async def _add(self, device: str, pairing: str, event: Mapping[str, Any]) -> None:
+        await self._sessions.add_control_event(device, pairing, event)
         await self._events.add(device, pairing, event)
         self._metrics.count(Counter.CONTROL_EVENTS, event["kind"])
 

@@ -33,8 +33,10 @@ from function_app.services.actions.action_store import ActionStore, StoredAction
 from function_app.services.actions.dispatcher import ActionDispatcher, MovementUnavailable, PermissionEnded
 from function_app.services.actions.queue import TIMEOUT, ActionQueues
 from function_app.services.actions.start import ABANDON_MS
+from function_app.services.actions.trial_log import TrialLog
 from function_app.services.audit import audit_log as audit_log_
 from function_app.services.audit.audit_log import AuditLog
+from function_app.services.autonomy.session_actions import SessionActions
 from function_app.services.control import control_events as control_events_
 from function_app.services.control.control_events import ControlEvents
 from function_app.services.health.reported_faults import ReportedFaults
@@ -79,6 +81,8 @@ class Scheduler:
         invitations: Invitations,
         api_keys: ApiKeys,
         control_events: ControlEvents,
+        session_actions: SessionActions,
+        trial_log: TrialLog,
         audit_log: AuditLog,
         access: BrokerAccess,
         retention: Retention,
@@ -100,6 +104,8 @@ class Scheduler:
         self._invitations = invitations
         self._api_keys = api_keys
         self._control_events = control_events
+        self._session_actions = session_actions
+        self._trial_log = trial_log
         self._access = access
         self._retention = retention
         self._reported_faults = reported_faults
@@ -175,12 +181,14 @@ class Scheduler:
             await self._queues.change(action_id, lambda action: after_set_back(action, now_ms), existing=result)
             or result
         )
+        await self._trial_log.record(result.action)
         verdict = next_step(result.action, now_ms)
         if verdict is NextStep.DOUBT and not current:
             verdict = NextStep.ASK
         if verdict in _ENDING:
             after = await self._ended(result, verdict, now_ms)
             if after is not None and after.status.terminal:
+                await self._session_actions.record(after)
                 await self._schedule_deletion(after)
             elif after is not None:  # the outcome is unknown, or an ack arrived concurrently
                 await self._reminders.schedule(action_id, next_check_ms(after, now_ms))

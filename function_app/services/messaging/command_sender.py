@@ -5,7 +5,7 @@ import logging
 from msgspec import UNSET
 from msgspec.structs import replace
 
-from device_agent.protocol import CancelAction, Command, Request, RunMovement, StopDevice, codec
+from device_agent.protocol import CancelAction, Command, Request, RunMovement, RunTrial, StopDevice, codec
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.fields import printable
 from device_agent.protocol.security import signing
@@ -62,6 +62,9 @@ class CommandSender:
         """
         if isinstance(command.request, RunMovement):
             command = replace(command, request=await self._signed_for_devices(command.request))
+        elif isinstance(command.request, RunTrial):
+            movement = await self._signed_for_devices(command.request.movement)
+            command = replace(command, request=replace(command.request, movement=movement))
         try:
             payload = signing.sign(codec.encode(command), await self._keys.for_devices())
         except ProtocolError as error:

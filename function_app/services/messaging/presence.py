@@ -20,9 +20,11 @@ from function_app.ports.tables import Tables
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.devices.control_rows import record_device_epochs
 from function_app.services.health.reported_faults import ReportedFaults
+from function_app.services.messaging.camera_consents import CameraConsents
 from function_app.services.messaging.key_announcer import KeyAnnouncer
 from function_app.services.storage import records
 from function_app.services.telemetry.event_log import EventLog
+from function_app.services.telemetry.session_log import SessionLog
 
 SAME_STOP_MS = 60_000
 """Longest time in which the report of a Stop may follow its record [ms]."""
@@ -38,16 +40,20 @@ class PresenceIngest:
         *,
         tables: Tables,
         events: EventLog,
+        sessions: SessionLog,
         audit_log: AuditLog,
         reported_faults: ReportedFaults,
         key_announcer: KeyAnnouncer,
+        camera_consents: CameraConsents,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._events = events
+        self._sessions = sessions
         self._audit_log = audit_log
         self._reported_faults = reported_faults
         self._key_announcer = key_announcer
+        self._camera_consents = camera_consents
         self._clock = clock
 
     async def ingest(self, topic: Topic, payload: bytes, *, by: Transport) -> None:
@@ -97,6 +103,7 @@ class PresenceIngest:
                 self._tables, records.AGENTS, topic.agent, f"state:{topic.device}", lambda _: last_state, LastState
             )
             await self._key_announcer.on_state(agent, topic.device)
+            await self._camera_consents.on_state(agent, topic.device, state)
         elif topic.kind == topics.DESC and not topic.name:
             description = codec.decode(payload, Description)
             await records.upsert(
@@ -112,6 +119,9 @@ class PresenceIngest:
         if event.at_ms > LAST_MS:
             raise ProtocolError("the event's `at_ms` is not a time of milliseconds since 1970")
         device = device_id(topic.agent, topic.device)
+        if event.kind == EventKind.ACTIVITY:
+            await self._sessions.add_activity(device, agent.pairing, event.data)
+            return
         await self._events.add(device, agent.pairing, msgspec.to_builtins(event))
         if event.kind == EventKind.STOP_LATCHED and not await self._is_recorded(device, agent.pairing, event):
             await self._audit_log.append_all(agent.account or CLOUD, [_stop_entry(device, event)])

@@ -31,6 +31,7 @@ from function_app.services.identity.authenticator import all_viewers
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import Retention
+from function_app.services.telemetry.recordings import Recordings
 from function_app.services.telemetry.series_writer import MARGIN_MS, SeriesWriter
 
 CHECK_MS: Final = 5_000
@@ -39,6 +40,9 @@ _NOTE: Final = "leave:"
 _RETAINED: Final = ((topics.STATE, ""), (topics.DESC, ""), (topics.DESC, topics.TWIN))
 
 _log = logging.getLogger(__name__)
+
+_MEASUREMENTS = (records.EVENTS, records.SESSIONS, records.TRIALS, records.FAULTS, records.DIAGNOSTICS, records.LATENCY)
+"""Tables with a partition for each pairing of a device."""
 
 
 class Offboarding:
@@ -56,6 +60,7 @@ class Offboarding:
         certificates: Certificates,
         bus: CommandBus,
         series: SeriesWriter,
+        recordings: Recordings,
         retention: Retention,
         control_events: ControlEvents,
         clock: Clock,
@@ -69,6 +74,7 @@ class Offboarding:
         self._certificates = certificates
         self._bus = bus
         self._series = series
+        self._recordings = recordings
         self._retention = retention
         self._control_events = control_events
         self._clock = clock
@@ -127,11 +133,11 @@ class Offboarding:
             await self._delete(records.MEMBERS, leaving.account, f"agent:{agent.id}", leaving)
 
     async def _delete_measurements(self, device: Device) -> None:
-        """Delete measurements, events and faults, after all processes have stopped writing to the former pairing."""
+        """Delete measurements, recordings, events and faults, after all processes have stopped writing them."""
         due_ms = self._clock.now_ms() + MARGIN_MS
-        for table in (records.EVENTS, records.FAULTS, records.DIAGNOSTICS, records.LATENCY):
-            partition = f"{device.id}/{device.pairing}"
-            await self._retention.delete_rows_at(table, partition, first="", last=None, due_ms=due_ms)
+        await self._recordings.forget(device, due_ms=due_ms)
+        for table in _MEASUREMENTS:
+            await self._retention.delete_partition_at(table, f"{device.id}/{device.pairing}", due_ms=due_ms)
 
     async def _end_actions(self, device: Device, why: str) -> None:
         _, message = DROPPED[why]

@@ -14,6 +14,8 @@ from tests.security.tenants.world import World
 PART = 65_536
 LARGER = {"add_robot_type": MAX_UPLOAD, "add_robot_type_preview": MAX_UPLOAD}
 """Routes with a larger limit than the default."""
+PAGE_ONLY = {"renew_token"}
+"""Routes that need the cookie of a page, which no caller here has. They are rejected before they read the body."""
 
 
 class Endless:
@@ -70,6 +72,10 @@ def test_every_route_rejects_a_body_that_is_too_large_without_reading_it(world: 
         assert "413" in operation["responses"], name
         limit, role = LARGER.get(name, MAX_BODY), caller(operation)
         body = Endless(limit)
+        if name in PAGE_ONLY:
+            problem(send_body(world, name, method, path, role, content=body.parts()), 401, "unauthorized")
+            assert body.taken == 0, f"{name} took {body.taken} bytes"
+            continue
         problem(send_body(world, name, method, path, role, content=body.parts()), 413, "too-large")
         assert limit < body.taken <= limit + 2 * PART, f"{name} took {body.taken} bytes"
         body = Endless(limit)

@@ -180,10 +180,10 @@ def control(run: Run, demo: httpx.Client, bert: httpx.Client, device: str) -> No
                 client.close()
     ok(demo.post(f"/devices/{device}/stop", json={"reason": "x"}))
     capture = {"stream": "camera", "length": 3, "content_type": "image/png"}
-    begun = ok(demo.post(f"/devices/{device}/uploads", json=capture))
-    run.secrets["upload address"] = begun["url"].rpartition("/")[2]
-    httpx.put(begun["url"], headers=begun["headers"], content=b"abc")
-    assert httpx.put(begun["url"] + "x", headers=begun["headers"], content=b"abc").is_client_error
+    upload = ok(demo.post(f"/devices/{device}/uploads", json=capture))
+    run.secrets["upload address"] = upload["url"].rpartition("/")[2]
+    httpx.put(upload["url"], headers=upload["headers"], content=b"abc")
+    assert httpx.put(upload["url"] + "x", headers=upload["headers"], content=b"abc").is_client_error
 
 
 def pairing(run: Run, demo: httpx.Client) -> None:

@@ -40,6 +40,7 @@ def test_a_server_that_ignores_sigterm_is_killed() -> None:
     [
         "device_agent",
         "function_app",
+        "infra.foxglove",
         *(f"infra.{name}" for name in ("embedded_broker", "home_assistant", "local", "mosquitto", "prosody", "tls")),
     ],
 )

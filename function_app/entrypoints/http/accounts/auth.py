@@ -8,9 +8,9 @@ from function_app.domain.identity.accounts import Identity
 from function_app.entrypoints.http.accounts import schemas
 from function_app.entrypoints.http.accounts.cookies import clear_session, signed_in
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator, reject_cross_site
-from function_app.entrypoints.http.framework.responses import empty, json_response, read
+from function_app.entrypoints.http.framework.responses import empty, json_response, read, require_empty
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.entrypoints.http.framework.schemas import AccountRef
+from function_app.entrypoints.http.framework.schemas import AccountRef, EmptyRequest
 from function_app.services.devices.spaces import SpaceView
 
 
@@ -80,13 +80,16 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         await functions.invitations.redeem(Identity(account.id, account.name, done.session), invitation)
         return signed_in(settings, done, 201)
 
-    @routes.add("POST /auth/token", "Renew the access token", schemas.AccessToken, caller="page")
+    @routes.add(
+        "POST /auth/token", "Renew the access token", schemas.AccessToken, optional_body=EmptyRequest, caller="page"
+    )
     async def renew_token(request: Request) -> Response:
         """For programs that store the cookie. An access token is valid for 15 min, the session for 12 h.
 
         Requires the cookie and the session's CSRF token in ``X-CSRF-Token``. An access token cannot renew itself.
         """
         caller, _ = await auth.page(request)
+        await require_empty(request)
         token, lifetime_s = await functions.sessions.access_token(caller)
         body = schemas.AccessToken(
             access_token=token,
@@ -95,10 +98,12 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         )
         return json_response(body, headers={"Cache-Control": "no-store"})
 
-    @routes.add("POST /auth/sign-out", "Sign out", None)
+    @routes.add("POST /auth/sign-out", "Sign out", None, optional_body=EmptyRequest)
     async def sign_out(request: Request) -> Response:
         """Ends the session of the token or cookie, releases its leases, and clears the cookie."""
-        await functions.sign_out.end(await auth.account(request))
+        caller = await auth.account(request)
+        await require_empty(request)
+        await functions.sign_out.end(caller)
         return empty({"Set-Cookie": clear_session(settings)})
 
     @routes.add("GET /spaces", "List spaces", schemas.SpaceList)

@@ -9,8 +9,9 @@ from function_app.domain.actions.action import Action
 from function_app.entrypoints.http.actions import schemas
 from function_app.entrypoints.http.actions.serializers import action_out
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
-from function_app.entrypoints.http.framework.responses import json_response, read
+from function_app.entrypoints.http.framework.responses import json_response, read, require_empty
 from function_app.entrypoints.http.framework.routing import PREFIX, Cursor, Limit, Routes
+from function_app.entrypoints.http.framework.schemas import EmptyRequest
 from function_app.services.actions.requests import ActionRequest
 
 Key = Annotated[
@@ -67,10 +68,13 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
             await shown(await functions.actions.get(caller, action, wait_ms=wait_ms, wait_for=wait_for))
         )
 
-    @routes.add("POST /actions/{action}/cancel", "Cancel an action", {202: schemas.ActionOut}, 404)
+    @routes.add(
+        "POST /actions/{action}/cancel", "Cancel an action", {202: schemas.ActionOut}, 404, optional_body=EmptyRequest
+    )
     async def cancel_action(request: Request, action: str) -> Response:
         """Sends a cancel command to the device. A queued action ends immediately. Poll the action for its end."""
         caller = await auth.account(request)
+        await require_empty(request)
         return json_response(await shown(await functions.actions.cancel(caller, action)), 202)
 
     return routes

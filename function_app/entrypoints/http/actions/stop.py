@@ -6,8 +6,9 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.text import clean_label
 from function_app.entrypoints.http.actions import schemas
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
-from function_app.entrypoints.http.framework.responses import json_response, problem_item, read_or
+from function_app.entrypoints.http.framework.responses import json_response, problem_item, read_or, require_empty
 from function_app.entrypoints.http.framework.routing import Routes
+from function_app.entrypoints.http.framework.schemas import EmptyRequest
 from function_app.services.actions.stop import StopOutcome, StopResult
 
 _MESSAGES = {
@@ -43,13 +44,16 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         item = _item(result)
         return json_response(item, item.status)
 
-    @routes.add("POST /devices/{device}/stop/reset", "Reset a Stop", schemas.ResetConfirmation, 404)
+    @routes.add(
+        "POST /devices/{device}/stop/reset", "Reset a Stop", schemas.ResetConfirmation, 404, optional_body=EmptyRequest
+    )
     async def reset_stop(request: Request, device: str) -> Response:
         """Motion does not resume; control must be acquired again.
 
         Only for one device, and only by a person, who must have inspected it. API keys are rejected.
         """
         caller = await auth.account(request)
+        await require_empty(request)
         result = await functions.stop.reset(caller, device)
         rejection = result.reason
         reason = None if rejection is None else schemas.ReasonOut(code=rejection.code, message=rejection.message)

@@ -10,8 +10,9 @@ from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.control import schemas
 from function_app.entrypoints.http.control.serializers import control_request_out, lease_out
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
-from function_app.entrypoints.http.framework.responses import empty, json_response, read_or
+from function_app.entrypoints.http.framework.responses import empty, json_response, read_or, require_empty
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
+from function_app.entrypoints.http.framework.schemas import EmptyRequest
 
 EpochQuery = Annotated[int, Query(ge=1, le=2**53, description="The epoch of the lease to release.")]
 
@@ -135,10 +136,12 @@ def _request_routes(routes: Routes, functions: Functions, auth: RequestAuthentic
         "Reject a control request",
         schemas.ControlRequestOut,
         (404, 409),
+        optional_body=EmptyRequest,
     )
     async def reject_control_request(request: Request, device: str, request_id: str) -> Response:
         """Lease holder only. The lease does not change."""
         caller = await auth.account(request)
+        await require_empty(request)
         lease, control_request = await functions.control_requests.reject(caller, device, request_id)
         return json_response(control_request_out(control_request, lease, caller, functions.clock.now_ms()))
 

@@ -9,8 +9,9 @@ from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.devices import schemas
 from function_app.entrypoints.http.devices.serializers import device_out
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
-from function_app.entrypoints.http.framework.responses import empty, json_response, read
+from function_app.entrypoints.http.framework.responses import empty, json_response, read, require_empty
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
+from function_app.entrypoints.http.framework.schemas import EmptyRequest
 
 _VIEWER_REFRESH_MS = 10_000
 """Interval at which a page must renew its viewer registration."""
@@ -57,13 +58,20 @@ def _label_and_viewer_routes(routes: Routes, functions: Functions, auth: Request
         await functions.rename.rename(caller, device, label)
         return json_response(device_out(functions, await functions.devices.view(caller, device), caller))
 
-    @routes.add("PUT /devices/{device}/viewers", "Register as a viewer and list other viewers", schemas.ViewersOut, 404)
+    @routes.add(
+        "PUT /devices/{device}/viewers",
+        "Register as a viewer and list other viewers",
+        schemas.ViewersOut,
+        404,
+        optional_body=EmptyRequest,
+    )
     async def add_viewer(request: Request, device: str) -> Response:
         """For all accounts with access to the device.
 
         A registration expires after 25 s. A repetition within 5 s has no effect.
         """
         caller = await auth.account(request)
+        await require_empty(request)
         others = tuple(
             schemas.ViewerOut(
                 name=other.name,

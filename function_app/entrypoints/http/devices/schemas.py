@@ -4,9 +4,10 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from device_agent.protocol import State
+from device_agent.protocol import Id, State
+from function_app.entrypoints.http.actions.schemas import ReasonOut
 from function_app.entrypoints.http.control.schemas import LeaseOut
-from function_app.entrypoints.http.framework.schemas import AccountRef, Moment, Request, Response
+from function_app.entrypoints.http.framework.schemas import AccountRef, Moment, Request, Response, WaitMs
 
 LABEL_PATTERN = r"^[^\x00-\x08\x0e-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x08\x0e-\x1f\x7f]*$"
 """Printable text without terminal control characters."""
@@ -67,3 +68,27 @@ class ViewersOut(Response, frozen=True, kw_only=True):
 
     items: tuple[ViewerOut, ...]
     refresh_ms: int
+
+
+class CameraConsentRequest(Request, frozen=True, kw_only=True):
+    """The cameras of the device that may be recorded from now on; all others must not. Empty: none.
+
+    ``wait_ms``: how long to wait until the device has stored the decision [ms].
+    """
+
+    cameras: Annotated[tuple[Id, ...], Meta(max_length=16)]
+    wait_ms: WaitMs = 5_000
+
+
+class CameraConsentOut(Response, frozen=True, kw_only=True):
+    """The owner's newest decision which cameras may be recorded.
+
+    ``by`` and ``at``: null if there was no decision. ``confirmed``: the device has stored it. Otherwise it is delivered
+    when the device connects; ``reason``: why the device has rejected it.
+    """
+
+    cameras: tuple[str, ...]
+    by: str | None
+    at: Moment | None
+    confirmed: bool
+    reason: ReasonOut | None = None

@@ -7,6 +7,7 @@ import msgspec
 from fastapi import Request, Response
 
 from function_app.domain.common.problems import Problem, invalid
+from function_app.entrypoints.http.framework.schemas import EmptyRequest
 from function_app.entrypoints.http.framework.schemas import Problem as ProblemOut
 
 MAX_BODY = 1_000_000
@@ -82,6 +83,15 @@ async def read_or(request: Request, kind: type[T], default: T) -> T:
         return default
     decoded: T = await read(request, kind)
     return decoded
+
+
+async def require_empty(request: Request) -> None:
+    """Check that the body is empty, or an object without fields.
+
+    Raises:
+        Problem: ``too-large``, ``invalid``.
+    """
+    await read_or(request, EmptyRequest, EmptyRequest())
 
 
 async def _bytes(request: Request, limit: int = MAX_BODY) -> bytes:

@@ -20,6 +20,10 @@ class Request(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base class of request bodies. Unknown fields are rejected."""
 
 
+class EmptyRequest(Request, frozen=True, kw_only=True):
+    """A body without fields."""
+
+
 class AgentRequest(Request, frozen=True, kw_only=True, forbid_unknown_fields=False):
     """Base class of request bodies of agents. Unknown fields are ignored: the agent may be newer."""
 

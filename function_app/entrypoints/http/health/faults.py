@@ -6,8 +6,9 @@ from fastapi import Query, Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.entrypoints.http.framework.authentication import RequestAuthenticator
-from function_app.entrypoints.http.framework.responses import json_response
+from function_app.entrypoints.http.framework.responses import json_response, require_empty
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
+from function_app.entrypoints.http.framework.schemas import EmptyRequest
 from function_app.entrypoints.http.health import schemas
 from function_app.entrypoints.http.health.serializers import fault_out
 from function_app.services.devices.device_access import require_operator
@@ -34,12 +35,17 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
         )
 
     @routes.add(
-        "POST /devices/{device}/faults/{fault}/acknowledge", "Acknowledge a fault", schemas.FaultOut, (404, 409)
+        "POST /devices/{device}/faults/{fault}/acknowledge",
+        "Acknowledge a fault",
+        schemas.FaultOut,
+        (404, 409),
+        optional_body=EmptyRequest,
     )
     async def acknowledge_fault(request: Request, device: str, fault: str) -> Response:
         """The fault stays open until it is cleared. It records the first account that acknowledged it."""
         caller = await auth.account(request)
         target = require_operator(await functions.devices.get(caller, device))
+        await require_empty(request)
         return json_response(fault_out(await functions.faults.acknowledge(target, fault, by=caller.name)))
 
     return routes

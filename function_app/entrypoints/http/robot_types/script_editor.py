@@ -12,7 +12,6 @@ from function_app.entrypoints.http.framework.responses import json_response, rea
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.robot_types import schemas
 from function_app.services.robot_types.parameter_schema import ObjectSchema
-from function_app.services.robot_types.script_linter import check_script, names_of
 
 
 def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
@@ -27,6 +26,8 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     )
     async def get_scripting(request: Request, robot_type: str) -> Response:
         """Returns calls with their signatures, importable modules, and names that the robot type defines."""
+        from function_app.services.robot_types.script_linter import names_of  # noqa: PLC0415 (parsers slow down a cold start)
+
         manifest = await functions.robot_types.get(await auth.account(request), robot_type)
         return json_response(schemas.ScriptingOut(api=script_api(), names=names_of(manifest)))
 
@@ -39,6 +40,8 @@ def router(functions: Functions, auth: RequestAuthenticator) -> Routes:
     )
     async def check_movement(request: Request, robot_type: str) -> Response:
         """Returns problems with their positions. The script is not saved or run."""
+        from function_app.services.robot_types.script_linter import check_script  # noqa: PLC0415 (parsers slow down a cold start)
+
         manifest = await functions.robot_types.get(await auth.account(request), robot_type)
         payload: schemas.ScriptCheckRequest = await read(request, schemas.ScriptCheckRequest)
         checked = check_script(payload.source, manifest)

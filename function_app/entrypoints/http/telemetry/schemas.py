@@ -5,10 +5,20 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from device_agent.protocol import Id
-from function_app.entrypoints.http.framework.schemas import DeviceName, Moment, Request, Response
-from function_app.ports.blobs import MAX_UPLOAD_BYTES
+from function_app.entrypoints.http.framework.schemas import (
+    AgentRequest,
+    DeviceName,
+    Epoch,
+    Moment,
+    Name,
+    Request,
+    Response,
+)
+from function_app.ports.blobs import MAX_BYTES, MAX_UPLOAD_BYTES
 from function_app.services.telemetry.latency import Path, Transport
 
+SegmentNumber = Annotated[int, Meta(ge=0, le=999_999)]
+SegmentLength = Annotated[int, Meta(ge=1, le=MAX_BYTES)]
 Resolution = Literal["raw", "10s", "1min", "10min", "1h", "6h", "1d"]
 
 
@@ -171,6 +181,47 @@ class AgentCompleteRequest(Request, frozen=True, kw_only=True):
     """The agent's device."""
 
     device: DeviceName
+
+
+class RecordingRequest(AgentRequest, frozen=True, kw_only=True):
+    """A segment of a recording. Times are those of its first and last message [ms since 1970]."""
+
+    device: DeviceName
+    epoch: Epoch
+    segment: SegmentNumber
+    started_ms: AtMs
+    ended_ms: AtMs
+    length: SegmentLength
+    sha256: Sha256
+    overview_length: SegmentLength
+    overview_sha256: Sha256
+    cameras: Annotated[tuple[Name, ...], Meta(max_length=16)] = ()
+    rows: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
+
+
+class SegmentRequest(AgentRequest, frozen=True, kw_only=True):
+    """Names an announced segment. ``pending``: the other segments of the session that the agent will upload."""
+
+    device: DeviceName
+    epoch: Epoch
+    segment: SegmentNumber
+    pending: Annotated[tuple[SegmentNumber, ...], Meta(max_length=1000)] | None = None
+
+
+class FileUpload(Response, frozen=True, kw_only=True):
+    """Send the content to ``url`` with ``method`` and exactly these headers."""
+
+    method: str
+    url: str
+    headers: dict[str, str]
+
+
+class RecordingUpload(Response, frozen=True, kw_only=True):
+    """``stored``: nothing is to be done. Otherwise send each file that is not null, then complete the segment."""
+
+    stored: bool
+    segment: FileUpload | None = None
+    overview: FileUpload | None = None
 
 
 class UploadStarted(Response, frozen=True, kw_only=True):

@@ -220,6 +220,16 @@ def test_an_action_without_permission_fails_unless_the_device_has_completed_it(l
     assert withdraw(ended, "unshared", "Not shared.", 1_000_700) is ended
 
 
+@pytest.mark.parametrize("last", [Status.CANCELLED, Status.EXPIRED])
+def test_an_action_that_was_cancelled_before_its_permission_ended_is_cancelled(last: Status) -> None:
+    """Simulation seed 1343: the worker was suspended, so the device's report arrived after the withdrawal."""
+    withdrawn = withdraw(replace(NEW, cancel_id="c"), "unshared", "Not shared.", 1_000_500)
+    ended = apply_report(withdrawn, AckReport(last, 9, 1_000_600, reason={"code": "cancelled", "message": "x"}))
+    assert ended.status is Status.CANCELLED
+    assert ended.reason is not None
+    assert ended.reason["code"] == "cancelled"
+
+
 def test_an_action_without_permission_is_cancelled_until_the_device_may_be_asked() -> None:
     withdrawn = withdraw(NEW, "unshared", "Not shared.", 1_000_500)
     assert next_step(withdrawn, NEW.expires_ms - 1) is NextStep.CANCEL, "the device would start it"

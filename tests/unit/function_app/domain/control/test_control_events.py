@@ -39,7 +39,11 @@ def facts(before: Lease | None, after: Lease, now_ms: int = NOW) -> list[tuple[s
         (
             HELD,
             lease.invalidate(HELD, pairing="p", now_ms=NOW),
-            ("stop-reset-ordered-2", {"epoch": 2, "caller": "dora", "holder": "", "from": "anna"}, "info"),
+            (
+                "stop-reset-ordered-2",
+                {"epoch": 2, "caller": "dora", "holder": "", "from": "anna", "ended_epoch": 1},
+                "info",
+            ),
         ),
         (
             REQUESTED,
@@ -105,7 +109,7 @@ def test_a_new_request_records_the_timeout_of_the_previous_one_but_not_of_the_le
 def test_control_that_ended_with_the_permission_names_the_reason(why: str, text: str) -> None:
     event = control_ended(HELD, Lease(epoch=2), why=why, now_ms=NOW)
     assert (event.id, event.fact, event.at_ms, event.severity) == ("control-ended-2", Fact.ENDED, NOW, "info")
-    assert event.data == {"epoch": 2, "holder": "anna", "reason": why}
+    assert event.data == {"epoch": 2, "holder": "anna", "reason": why, "ended_epoch": 1}
     assert text in event.message
     assert "anna" in event.message
 

@@ -184,7 +184,7 @@ def test_an_event_names_the_former_holder() -> None:
         "data": {},
     }
     ended = control_ended(HELD, Lease(epoch=2), why="moved", now_ms=START)
-    assert (ended.fact, ended.data) == (Fact.ENDED, {"epoch": 2, "holder": "anna", "reason": "moved"})
+    assert (ended.fact, ended.data) == (Fact.ENDED, {"epoch": 2, "holder": "anna", "reason": "moved", "ended_epoch": 1})
 
 
 Step = tuple[str, Identity, int]

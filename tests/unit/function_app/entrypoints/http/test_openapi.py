@@ -72,6 +72,11 @@ def test_every_operation_is_complete(document: dict[str, Any]) -> None:
     assert len(names) == len(set(names)) > 100
 
 
+def test_every_request_that_changes_something_declares_its_body(document: dict[str, Any]) -> None:
+    for method, path, operation in operations(document):
+        assert ("requestBody" in operation) is (method in {"POST", "PUT"}), f"{method} {path}"
+
+
 class _Page(HTMLParser):
     def __init__(self) -> None:
         super().__init__()

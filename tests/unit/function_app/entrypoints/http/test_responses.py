@@ -25,6 +25,12 @@ from tests.harness.cloud.cloud import settings as cloud_settings
 SIGN_IN = f"{API}/auth/sign-in"
 DEVICE = "abcdefgh23-arm"
 OPTIONAL_BODY = (f"/devices/{DEVICE}/lease", f"/devices/{DEVICE}/stop")
+WITHOUT_FIELDS = [
+    f"/devices/{DEVICE}/stop/reset",
+    f"/devices/{DEVICE}/lease/requests/r/reject",
+    "/actions/a/cancel",
+    "/auth/sign-out",
+]
 WITH_BODY = ["/auth/sign-in", "/agents/enroll", "/agents/claim", "/mqtt/credentials", f"/devices/{DEVICE}/actions"]
 BODIES = {
     "empty": b"",
@@ -65,6 +71,15 @@ def test_an_invalid_body_is_rejected_with_a_problem(anna: Person, path: str, bod
         problem(response, 404, "device-unknown")
     else:
         problem(response, 422, "invalid")
+
+
+@pytest.mark.parametrize("path", WITHOUT_FIELDS)
+def test_a_body_without_fields_may_be_empty_but_contains_nothing_else(anna: Person, path: str) -> None:
+    for body in (b'{"epoch": 1}', b"null", b"[]", b"text", b"[" * 200_000):
+        assert "body" in problem(anna.request("POST", path, content=body), 422, "invalid")["detail"]
+    if path != "/auth/sign-out":
+        for body in (b"", b"{}"):
+            assert anna.request("POST", path, content=body).status_code == 404
 
 
 class TestBodySize:

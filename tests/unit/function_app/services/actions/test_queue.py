@@ -196,7 +196,7 @@ def test_concurrent_acks_start_the_next_once(open_cloud: OpenCloud, anna: Person
     topic = topics.parse(robot.topic(topics.ACK))
     for before, action in zip([running, *waiting[:-1]], waiting, strict=True):
         done = codec.encode(robot.ack(before, AckStatus.DONE))
-        for call in [each.begin(each.functions.action_acks.ingest(topic, done)) for each in instances]:
+        for call in [each.begin(each.functions.action_acks.ingest(topic, done, by="mqtt")) for each in instances]:
             call()
         assert started(anna, action)
     assert sent(robot) == [running, *waiting]

@@ -14,6 +14,7 @@ from function_app.domain.actions.queue import UNPAIRED
 from function_app.domain.common.problems import Problem
 from function_app.ports.tables import Conflict
 from function_app.services.actions.dispatcher import PermissionEnded
+from function_app.services.actions.queue import CHECK_MS
 from function_app.services.devices.control_rows import read_control_rows
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
@@ -25,9 +26,11 @@ from tests.unit.function_app.services.actions.queue_requests import (
     pass_time,
     queued,
     reason,
+    reminders,
     sent,
     started,
 )
+from tests.unit.function_app.services.sharing.shares import share
 
 MISSING = "00000000000000000000"
 
@@ -254,6 +257,26 @@ def test_a_queued_movement_is_sent_with_its_parameters(anna: Person, robot: Robo
     (command,) = robot.received(RunMovement)
     assert isinstance(command.request, RunMovement)
     assert (command.id, command.request.parameters) == (waiting, request["parameters"])
+
+
+def test_a_queued_movement_of_the_owner_is_sent_for_another_operator(
+    cloud: Cloud, anna: Person, robot: Robot, running: str
+) -> None:
+    assert anna.put("/robot-types/ur5/movements/mine", {"source": "robot.home()"}).status_code == 201
+    bert = cloud.sign_in("bert")
+    share(anna, f"devices/{robot.device}", bert, "operator")
+    waiting = queued(bert, robot.device, request={"kind": "run_movement", "name": "mine"})
+    robot.report(running, AckStatus.DONE)
+    (command,) = robot.received(RunMovement)
+    assert isinstance(command.request, RunMovement)
+    assert (command.id, command.request.author, command.caller) == (waiting, anna.account, "bert")
+
+
+def test_a_check_is_due_after_the_queue_is_written(cloud: Cloud, robot: Robot) -> None:
+    """A reminder that is due before is deleted, because the queue is empty; nothing would advance the queue."""
+    now_ms = cloud.clock.now_ms()
+    cloud.run(cloud.functions.queues.schedule_check(robot.device))
+    assert reminders(cloud) == [f"{now_ms + 1 + CHECK_MS:013d}:queue:{robot.device}"]
 
 
 def test_permission_ends_with_the_pairing(cloud: Cloud, anna: Person, robot: Robot, running: str) -> None:

@@ -87,6 +87,7 @@ def test_two_starts_with_one_key_at_the_same_time_are_one_action(
     with mock.patch.object(memory.tables, "batch", overtaken):
         action = anna.start(robot.device, idempotency_key="k", wait_ms=0).json()
     assert [action["id"]] == before
+    assert robot.received(MoveJoints) == [], "the other start publishes it"
     rows = control_rows(robot.cloud, robot.device)
     assert [key for key in rows if key.startswith("action:")] == [f"action:{action['id'].rpartition('-')[2]}"]
 

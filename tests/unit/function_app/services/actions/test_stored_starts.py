@@ -6,8 +6,10 @@ from unittest import mock
 import msgspec
 import pytest
 
-from device_agent.protocol import MoveJoints, RunMovement
+from device_agent.protocol import SHIPPED, MoveJoints, RunMovement
 from function_app.domain.actions.action import RETRY_MS
+from function_app.domain.common.json_depth import MAX_LEVELS
+from function_app.domain.common.problems import not_found
 from function_app.services.actions.start import ABANDON_MS, PINNED
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
@@ -109,6 +111,35 @@ def test_a_movement_is_pinned_with_the_default_parameters(cloud: Cloud, anna: Pe
     assert row["request"]["parameters"] == {"times": 3}
 
 
+def test_a_built_in_movement_has_no_account_as_author(anna: Person, robot: Robot) -> None:
+    anna.start(robot.device, request={"kind": "run_movement", "name": "slow_square"})
+    (command,) = robot.received(RunMovement)
+    assert isinstance(command.request, RunMovement)
+    assert command.request.author == SHIPPED
+
+
+def test_parameters_that_no_script_accepts_are_rejected_first(anna: Person, robot: Robot) -> None:
+    nested: dict[str, Any] = {}
+    for _ in range(MAX_LEVELS + 1):
+        nested = {"a": nested}
+    request = {"kind": "run_movement", "name": "missing", "parameters": nested}
+    problem(anna.start(robot.device, request=request, idempotency_key="k"), 422, "parameters-invalid")
+    problem(anna.start("aaaaaaaaaa-arm", request=request), 422, "parameters-invalid")
+
+
+def test_the_first_action_after_an_expired_lease_records_its_end_for_the_owner(
+    cloud: Cloud, anna: Person, bert: Person, robot: Robot
+) -> None:
+    share(anna, f"devices/{robot.device}", bert, "operator")
+    epoch = anna.take_lease(robot.device, lease_ms=1_000).json()["epoch"]
+    cloud.clock.advance(2)
+    action = bert.start(robot.device, wait_ms=10_000).json()["id"]
+    rows = control_rows(cloud, robot.device)
+    assert stored(cloud, action)["epoch"] == epoch + 1
+    expired, taken = (rows[f"event:{name}"] for name in (f"control-expired-{epoch}", f"control-taken-{epoch + 1}"))
+    assert (expired["owner"], taken["owner"], taken["by"]["account"]) == (anna.account, anna.account, bert.account)
+
+
 def test_collecting_data_fits_into_the_time_limit(anna: Person, robot: Robot) -> None:
     problem(anna.start(robot.device, request=COLLECT, timeout_ms=1_999), 422, "invalid")
     assert anna.start(robot.device, request=COLLECT, timeout_ms=2_000, wait_ms=10_000).status_code == 200
@@ -165,3 +196,19 @@ def test_a_start_whose_permission_ended_while_it_was_written_is_not_sent(
     (row,) = (data for name, data in control_rows(cloud, robot.device).items() if name.startswith("action:"))
     assert (row["status"], row["reason"]["code"]) == ("failed", why)
     assert anna.start(robot.device, wait_ms=10_000).status_code == 200, "the slot is free"
+
+
+def test_a_start_whose_permission_ended_is_ended_despite_a_concurrent_write(
+    cloud: Cloud, anna: Person, robot: Robot
+) -> None:
+    tables = cloud.functions.tables
+
+    async def changed_and_ended(*_: Any) -> None:
+        page = await tables.query(records.CONTROL, robot.device, first="action:", last="action;")
+        await tables.replace(records.CONTROL, page.rows[0].changed({**page.rows[0].data, "output": "x"}))
+        raise not_found("device", robot.device)
+
+    with mock.patch.object(cloud.functions.devices, "require_still_allowed", changed_and_ended):
+        problem(anna.start(robot.device), 404, "device-unknown")
+    (row,) = (data for name, data in control_rows(cloud, robot.device).items() if name.startswith("action:"))
+    assert (row["status"], row["output"]) == ("failed", "x")
