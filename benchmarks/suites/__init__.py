@@ -2,4 +2,4 @@
 
 from typing import Final
 
-NAMES: Final = ("papers", "operator", "path", "limit", "peers", "scale", "faults", "kills", "soak")
+NAMES: Final = ("papers", "operator", "path", "limit", "peers", "recording", "scale", "faults", "kills", "soak")
