@@ -19,10 +19,14 @@ SEEDS = range(8)
 
 pytestmark = pytest.mark.anyio
 
+_killed: list[SqliteTables] = []
+"""Stores that ended without closing their file. Without this list, the garbage collector would close it."""
+
 
 async def filled(path: Path, count: int) -> list[Row]:
     """Create rows of control and telemetry, and end without closing the file, as ``kill -9`` does."""
     tables = SqliteTables(path)
+    _killed.append(tables)
     rows = []
     for number in range(count):
         data = {"number": number, "text": "x" * (number % 300)}

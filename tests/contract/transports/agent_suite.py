@@ -15,7 +15,7 @@ import pytest
 
 from device_agent import bootstrap
 from device_agent.config import catalogue
-from device_agent.config.agent_config import AgentConfig, DeviceEntry, HttpPolling
+from device_agent.config.agent_config import AgentConfig, DeviceEntry, HttpPolling, Recording
 from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import Ack, AckStatus, MoveJoints, State, codec, topics
@@ -48,7 +48,11 @@ class PairedAgent:
         self.store = IdentityStore(folder)
         key = self.store.private_key(create=True)
         config = AgentConfig(
-            server=processes.url, name="lab", devices=(DeviceEntry(name="arm", type="ur5"),), **spoken.configuration
+            server=processes.url,
+            name="lab",
+            devices=(DeviceEntry(name="arm", type="ur5"),),
+            recording=Recording(enabled=False),
+            **spoken.configuration,
         )
         config.save(self.store.folder)
         api = CloudClient(processes.url, key, CloudClock())

@@ -120,16 +120,27 @@ def test_a_movement_runs_from_the_list(browser: Browser, arm: Robot) -> None:
         wait_until(lambda: commanded_speed(trace) == 0, "rest")
 
 
+STATUSES = """() => {
+    window.statuses = [];
+    const record = () => {
+        const status = document.querySelector("[data-testid=online]");
+        if (status !== null) window.statuses.push(status.textContent.toLowerCase());
+    };
+    new MutationObserver(record).observe(document.body, {subtree: true, childList: true, characterData: true});
+}"""
+"""Records every status of the robot, because the agent may be back before the test reads it."""
+
+
 def test_a_robot_that_goes_offline_is_shown_as_such(browser: Browser, machine: Machine) -> None:
     with operator(browser, machine) as page:
         online = page.get_by_test_id("online")
         expect(online).to_contain_text("online", ignore_case=True)
         # The supervisor restarts the killed agent; the page must show offline, then online.
-        seen: list[str] = []
+        page.evaluate(STATUSES)
         machine.kill("device_agent")
 
         def back_online() -> bool:
-            seen.append((online.text_content() or "").lower())
+            seen: list[str] = page.evaluate("() => window.statuses")
             return any("offline" in text or "stale" in text for text in seen) and "online" in seen[-1]
 
         wait_until(back_online, "offline, then online")

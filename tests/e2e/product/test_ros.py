@@ -240,6 +240,7 @@ def test_a_recorded_bag_plays_back(machine: Machine, system: RosSystem, output: 
     publish(system, 0.3)
     wait_until(lambda: output.read_text().count("the trajectory has ended") == 1, "the end of the trajectory")
     end(recording, signal.SIGINT)
+    wait_until(bag.exists, "the bag")  # The recorder's child process writes it, and may end later.
     info = system.run("rosbag", "info", str(bag)).stdout
     assert "trajectory_msgs/JointTrajectory" in info
     assert "sensor_msgs/JointState" in info

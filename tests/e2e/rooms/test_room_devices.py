@@ -145,7 +145,7 @@ def test_frames_reach_permitted_viewers(api: Api) -> None:
     frames = [camera_frames.decode(each) for each in pictures]
     assert {(each.width, each.height) for each in frames} == {(320, 240)}
     assert [each.sequence for each in frames] == sorted({each.sequence for each in frames})
-    assert all(each.jpeg.startswith(b"\xff\xd8") for each in frames)
+    assert all(each.content.startswith(b"\xff\xd8") for each in frames)
 
 
 LOOKS = """

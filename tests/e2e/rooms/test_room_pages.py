@@ -86,6 +86,12 @@ def test_plan_camera_and_lamp_of_the_room(browser: Browser, laboratory: Machine)
         bob.get_by_test_id("gather").click()
         expect(bob.get_by_test_id("gather-state")).to_have_attribute("data-running", "false")
 
+        # A device without joints has no autonomy.
+        expect(bob.get_by_test_id("to-autonomy")).to_have_count(0)
+        bob.evaluate("() => { location.hash += '/autonomy'; }")
+        expect(bob.get_by_test_id("no-autonomy")).to_be_visible()
+        expect(bob.get_by_role("link", name="Autonomy", exact=True)).to_have_count(0)
+
         # Restore the state for other tests, by keyboard.
         slider = ann.get_by_test_id("set-level")
         slider.focus()

@@ -69,7 +69,9 @@ def test_the_header_fits_a_phone_and_the_title_names_the_page(browser: Browser, 
     with person(browser, machine.sign_in_link()) as ann:
         ann.set_viewport_size({"width": 390, "height": 844})
         parts = ann.get_by_role("navigation", name="Main navigation").get_by_role("link")
-        expect(parts).to_have_text(["Devices", "Movements", "Robot types", "Health", "Latency", "Administration"])
+        expect(parts).to_have_text(
+            ["Devices", "Movements", "Robot types", "Health", "Latency", "Timeline", "Administration"]
+        )
         for part in parts.all():
             box = part.bounding_box()
             assert box is not None

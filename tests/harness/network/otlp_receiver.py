@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import pytest
+from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 
 from tests.fakes.tracing import TRACE
@@ -103,8 +105,29 @@ def start_receiver() -> Iterator[OtlpReceiver]:
             receiver.receive(content)
             self.respond(200, [("content-type", "application/x-protobuf")], b"")
 
-    with serve(Handler) as receiver.url:
+    with _ended_exporters(), serve(Handler) as receiver.url:
         try:
             yield receiver
         finally:
             receiver.answers.set()
+
+
+@contextlib.contextmanager
+def _ended_exporters() -> Iterator[None]:
+    """End the exporters of this process that the context creates: retries in the background use ``random``.
+
+    Hypothesis rejects a test of the same process during which that happens.
+    """
+    created: list[OTLPSpanExporter] = []
+    with pytest.MonkeyPatch.context() as patch:
+        initialize = OTLPSpanExporter.__init__
+
+        def record(exporter: OTLPSpanExporter, *arguments: Any, **options: Any) -> None:
+            initialize(exporter, *arguments, **options)
+            created.append(exporter)
+
+        patch.setattr(OTLPSpanExporter, "__init__", record)
+        yield
+    for exporter in created:
+        exporter.shutdown()
+    wait_until(lambda: not last_exports(), "the exporters to end")

@@ -3,7 +3,6 @@
 import contextlib
 import os
 import signal
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from tests.harness.cloud.cloud import API
 from tests.harness.cloud.cloud_processes import CloudProcesses, Server, start_cloud_processes
 from tests.harness.hosts.host import Program, environment_of, start_program
 from tests.harness.network.brokers import BrokerKind, wait_until
+from tests.harness.stores.small_disk import small_disk
 
 TOKEN = "a-token-of-the-monitoring"  # pragma: allowlist secret
 SHOWN_S = 5.0
@@ -90,19 +90,6 @@ def _duration_s(condition: Callable[[], object], what: str) -> float:
     started_s = time.monotonic()
     wait_until(condition, what)
     return time.monotonic() - started_s
-
-
-@contextlib.contextmanager
-def disk(folder: Path) -> Iterator[Path]:
-    """A folder on a small disk of its own, where this user may mount one."""
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "tmpfs", str(folder)]
-    if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
-        pytest.skip("this user cannot mount a disk; test_server_health.py tests the threshold")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 @contextlib.contextmanager
@@ -191,7 +178,7 @@ def test_a_frozen_and_a_killed_broker_are_shown(site: Site) -> None:
 
 
 def test_a_full_disk_is_shown(tmp_path: Path) -> None:
-    with disk(tmp_path / "disk") as folder, start_site("amqtt", folder) as site:
+    with small_disk(tmp_path / "disk", DISK_MB) as folder, start_site("amqtt", folder) as site:
         filler = folder / "filler"
         with contextlib.suppress(OSError), filler.open("wb") as file:
             while True:

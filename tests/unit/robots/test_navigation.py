@@ -5,7 +5,6 @@ import math
 import random
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -152,7 +151,7 @@ def play(lab: Laboratory, movement: str, parameters: dict[str, Any]) -> list[str
     def request(kind: str, **arguments: Any) -> Any:
         if kind == "say":
             return lines.append(arguments["text"])
-        if kind == "look":
+        if kind == "look_at":
             return None  # checked by its own tests
         try:
             return lab.robot.execute(script_calls.parse(json.dumps({"kind": kind, **arguments}).encode()))  # type: ignore[arg-type]
@@ -194,12 +193,20 @@ def test_qbo_drives_around_another_robot(lab: Laboratory) -> None:
 def test_qbo_visits_several_places_while_a_person_walks(lab: Laboratory, seed: int) -> None:
     rng = random.Random(seed)  # noqa: S311
     visited = 0
+    nao_m = lab.room.truth()["nao"]
     while visited < 12:
         x_m, y_m, yaw_rad = rng.uniform(-2.2, 2.2), rng.uniform(-1.8, 1.8), rng.uniform(-math.pi, math.pi)
         if not lab.free(x_m, y_m):
             continue
-        with suppress(Refused):
+        try:
             check(lab, x_m, y_m, yaw_rad)
+        except Refused as refused:
+            if refused.code == "position_conflict":
+                lab.wait(2.0)
+                assert "stool_seat" in lab.touched, "only what is too low for the depth cameras blocks the robot"
+                assert math.dist(lab.room.truth()["nao"], nao_m) < 0.02, "it does not push the other robot"
+                return
+        else:
             visited += 1
             continue
         # The person stands at the goal and waits for the robot to leave.
@@ -214,7 +221,7 @@ def test_qbo_visits_a_walking_person(settle_s: float) -> None:
     lab = Laboratory(settle_s=settle_s)
     lines = play(lab, "visit", {})
     lab.close()
-    assert lines[0].startswith("stands"), lines
+    assert lines[0].startswith("stopped"), lines
     assert lines[1] == "Hello!"
 
 

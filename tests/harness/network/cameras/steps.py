@@ -7,7 +7,7 @@ import pytest
 
 from device_agent.config.agent_config import DeviceEntry
 from device_agent.ports.sensor import Frame, RoomDriver, SensorError
-from device_agent.protocol import Stream
+from device_agent.protocol import CameraStream
 from device_agent.protocol.manifests.room import Watch
 from device_agent.sensors.camera.driver import CameraDriver
 from tests.harness.network.brokers import wait_until
@@ -21,7 +21,7 @@ def entry(driver: str, *, name: str = "door", **options: Any) -> DeviceEntry:
         name=name,
         type="camera",
         driver=driver,
-        cameras=(Stream(name="colour", rate_hz=10.0),),
+        cameras=(CameraStream(name="colour", rate_hz=10.0),),
         captures=("image",),
         watch=(Watch(source="colour", silent_s=10.0, stuck_s=60.0),),
         options=options,

@@ -189,6 +189,8 @@ class ALMemory:
         raise RuntimeError(f"no data '{key}'")
 
     def insertData(self, key, value):
+        if key == "Telescope/Beat" and self.body.disturbance == "beats":
+            return
         with self.body.lock:
             self.body.memory[key] = value
             self.body.inserted_s = time.monotonic() if key == "Telescope/Beat" else self.body.inserted_s
