@@ -3,7 +3,7 @@
 
 NAOqi has no timeout: a walk continues when the network fails. The agent's bridge counts in ``Telescope/Beat`` of
 ``ALMemory``, and this program repeats the number in ``Telescope/Echo``. When the number does not change any more, it
-ends the walk and holds the joints. See docs/robots/nao.md.
+ends the walk and holds the joints. The echo also contains how often it did. See docs/robots/nao.md.
 
 The only argument is the address of NAOqi; it is ``tcp://127.0.0.1:9559`` without one.
 """
@@ -44,7 +44,7 @@ class Watchdog:
         self._motion = motion
         self._names = motion.getBodyNames("Body")
         memory.insertData(BEAT, 0)
-        self._last = self._missed = 0
+        self._last = self._missed = self._stops = 0
         self._held = True
         self._targets = {}
 
@@ -53,7 +53,7 @@ class Watchdog:
         beat = self._memory.getData(BEAT)
         if beat != self._last:
             self._last, self._missed, self._held = beat, 0, beat == 0
-            self._memory.insertData(ECHO, beat)
+            self._memory.insertData(ECHO, [beat, self._stops])
         elif self._last:
             self._missed += 1
             self._stop(self._missed * CHECK_S)
@@ -63,6 +63,7 @@ class Watchdog:
             if not self._held or self._motion.moveIsActive():
                 self._motion.stopMove()
             if not self._held or self._has_new_commands():
+                self._stops += 1
                 self._hold()
                 self._held = True
 
