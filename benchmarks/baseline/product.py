@@ -306,11 +306,3 @@ def start_peer(module: str, *arguments: str) -> Iterator["subprocess.Popen[str]"
             yield process
         finally:
             process.terminate()
-
-
-def free_port() -> int:
-    """Returns a free TCP port."""
-    with socket.socket() as listener:
-        listener.bind((HOST, 0))
-        port: int = listener.getsockname()[1]
-        return port

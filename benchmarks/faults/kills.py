@@ -21,8 +21,9 @@ from benchmarks.faults.action_load import ActionLoad, count_returns, duplicated,
 from benchmarks.faults.recorder import Recorder
 from tests.faults.judge import Record
 from tests.faults.stack import now_ms
-from tests.harness.browser.product import Api, Machine, free_ports, start_program
+from tests.harness.browser.product import PORTS, Api, Machine, start_program
 from tests.harness.network.brokers import BrokerKind, wait_until
+from tests.harness.network.ports import free_port
 
 SUPERVISOR: Final = "supervisor"
 AGENT: Final = "agent"
@@ -105,7 +106,7 @@ class KillRuns:
         with contextlib.ExitStack() as on_error:
             on_error.push(self.__exit__)
             self._home = Path(self._closing.enter_context(tempfile.TemporaryDirectory(prefix="ts-")))
-            self._port = free_ports()
+            self._port = free_port(PORTS)
             self._recorder = Recorder(self._home / "recorder.socket")
             self._closing.callback(self._recorder.close)
             self._machine = self._start()

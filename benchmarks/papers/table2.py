@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.baseline.interleaved import SHARES, Exchange, measure_interleaved, median
-from benchmarks.baseline.product import free_port, start_peer
+from benchmarks.baseline.product import start_peer
 from benchmarks.papers import exchanges, http_polling
 from benchmarks.reporting.report import Cell, Chart, Claim, Report, Table, percentile
 from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
 from tests.harness.network.brokers import HOST, TRANSPORTS, RunningBroker, start_broker
 from tests.harness.network.delay import start_delay
+from tests.harness.network.ports import free_port
 from tests.harness.network.xmpp import start_prosody
 
 HTTP: Final = (

@@ -11,10 +11,11 @@ from typing import Any, Final
 
 from benchmarks.baseline.echo_servers import HOST
 from benchmarks.baseline.interleaved import Exchange
-from benchmarks.baseline.product import PERIOD_S, TIMEOUT_S, free_port, start_peer
+from benchmarks.baseline.product import PERIOD_S, TIMEOUT_S, start_peer
 from benchmarks.peers.arm import HOME_RAD, NAMES, setpoint
 from benchmarks.peers.robots import CONTROL, JOINTS, METHOD, ROS_TYPE, zenoh_peer
 from device_agent.protocol import JointTelemetry, codec
+from tests.harness.network.ports import free_port
 
 _PROGRAM: Final = "benchmarks.peers.robots"
 _CHANNEL_ID: Final = 1

@@ -17,11 +17,12 @@ from typing import Any, Final
 import msgspec
 
 from benchmarks.baseline.echo_servers import HOST
-from benchmarks.baseline.product import TIMEOUT_S, MeasuredProduct, free_port, start, start_peer
+from benchmarks.baseline.product import TIMEOUT_S, MeasuredProduct, start, start_peer
 from benchmarks.reporting.report import Cell, Chart, Claim, Table
 from benchmarks.scale.brokers import program, request
 from benchmarks.scale.http_load import HttpLoad, HttpLoadResult, Request
 from benchmarks.scale.processes import processor_s
+from tests.harness.network.ports import free_port
 from tests.harness.paths import ROOT
 
 CONNECTIONS: Final = 16

@@ -17,12 +17,12 @@ from benchmarks.baseline.product import (
     HttpConnection,
     MeasuredProduct,
     StreamingOperator,
-    free_port,
     start,
     start_peer,
 )
 from benchmarks.reporting.report import Claim, Report, Table
 from tests.harness.network.brokers import BROKERS
+from tests.harness.network.ports import free_port
 
 MAX_SETPOINT_RATIO: Final = 1.5
 MAX_ACTION_RATIO: Final = 2.5

@@ -8,10 +8,11 @@ from benchmarks.baseline.product import HttpConnection, MeasuredProduct
 from benchmarks.tracing import traced_programs
 from benchmarks.tracing.timestamps import TimestampReceiver
 from function_app import settings
-from tests.harness.browser.product import Machine, free_ports, start_program
+from tests.harness.browser.product import PORTS, Machine, start_program
 from tests.harness.cloud.cloud import Cloud
 from tests.harness.network.brokers import BrokerKind
 from tests.harness.network.delay import DelayedNetwork, start_delay
+from tests.harness.network.ports import free_port
 
 
 class TracedProduct(MeasuredProduct):
@@ -63,7 +64,7 @@ def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) 
         joints: Robot → joints with traced motion, separated by ``+``.
         more: Further settings.
     """
-    port = free_ports()
+    port = free_port(PORTS)
     with contextlib.ExitStack() as stack:
         timestamps = stack.enter_context(TimestampReceiver())
         network = stack.enter_context(start_delay(port, port + 1, rtt_ms=0))

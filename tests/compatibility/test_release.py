@@ -5,7 +5,6 @@ import functools
 import json
 import os
 import shutil
-import socket
 import sqlite3
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from tests.compatibility.release import ReleaseUnavailableError, unpack
 from tests.harness.cloud.cloud import API
 from tests.harness.hosts.host import Program, environment_of, start_program
 from tests.harness.network.brokers import HOST, PATIENCE_S, wait_until
+from tests.harness.network.ports import free_port
 from tests.harness.paths import ROOT
 
 MOVE = {"kind": "move_joints", "position_rad": {"shoulder_pan": 0.1}, "speed": 1.0}
@@ -69,7 +69,7 @@ class Versions:
 
     def _serve(self, version: str, broker: Program) -> httpx.Client:
         listening = dict(part.split("=") for part in broker.read_line().split()[1:])
-        port = _free_port()
+        port = free_port()
         variables = {"TELESCOPE_HOME": str(self.home), "TELESCOPE_PORT": str(port)}
         variables |= {"TELESCOPE_MQTT_PORT": listening["tcp"], "TELESCOPE_WEBSOCKET_PORT": listening["websocket"]}
         for program in ("serve", "work"):
@@ -157,10 +157,3 @@ def _answers(person: httpx.Client) -> bool:
         return person.get("/accounts/me").status_code == httpx.codes.UNAUTHORIZED
     except httpx.TransportError:
         return False
-
-
-def _free_port() -> int:
-    with socket.socket() as listener:
-        listener.bind((HOST, 0))
-        port: int = listener.getsockname()[1]
-        return port

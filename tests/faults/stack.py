@@ -22,8 +22,9 @@ import msgspec
 
 from infra.local.supervisor import SupervisedProcess
 from tests.faults.console import OperatorConfig
-from tests.harness.browser.product import free_ports
+from tests.harness.browser.product import PORTS
 from tests.harness.network.brokers import MODULES, BrokerKind, wait_until
+from tests.harness.network.ports import free_port
 from tests.harness.network.proxy import HOST, Proxy
 from tests.harness.paths import ROOT
 
@@ -93,7 +94,7 @@ class Stack:
     def __init__(self, kind: BrokerKind, arms: int, *, watchdog_s: float) -> None:
         self.names = [f"arm{number}" for number in range(arms)]
         self.home = Path(tempfile.mkdtemp(prefix="ts-"))  # the path of a Unix socket has at most 108 bytes
-        self.port = free_ports()
+        self.port = free_port(PORTS)
         self.operator_port = self.port + 1
         self.setpoints: dict[str, list[float]] = defaultdict(list)
         self.commands: dict[str, list[float]] = defaultdict(list)

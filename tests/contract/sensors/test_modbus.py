@@ -15,6 +15,7 @@ from device_agent.sensors.modbus import bus
 from tests.contract.sensors.conftest import MakeDriver, connects, described, error_of
 from tests.contract.sensors.suite import RoomDriverContract
 from tests.harness.network.brokers import HOST, wait_until
+from tests.harness.network.ports import free_port
 from tests.harness.robots.room_devices.modbus import SIZE, ModbusPeer, words
 from tests.harness.robots.room_devices.serial_line import SerialCable
 
@@ -186,9 +187,7 @@ def test_a_closed_idle_connection_is_opened_again(make_driver: MakeDriver) -> No
 
 
 def test_a_refused_connection_is_a_fault(make_driver: MakeDriver) -> None:
-    with socket.socket() as free:
-        free.bind((HOST, 0))
-        port = free.getsockname()[1]
+    port = free_port()
     driver = make_driver(entry_of({"host": HOST, "port": port}))
     assert error_of(driver.connect) == f"{HOST}:{port} cannot be opened; check `host`, `port` and the network"
 

@@ -11,8 +11,9 @@ from tests.harness.browser.pages import assert_good_page
 from tests.harness.cloud.oidc_provider import CLIENT_ID, CLIENT_SECRET, new_key, start_provider
 from tests.harness.cloud.people import sign_in_link
 from tests.harness.hosts.host import environment_of, start_program
-from tests.harness.hosts.uvicorn import _free_port, _listens
+from tests.harness.hosts.uvicorn import _listens
 from tests.harness.network.brokers import wait_until
+from tests.harness.network.ports import free_port
 
 PASSWORD = "correct horse battery"
 
@@ -20,7 +21,7 @@ PASSWORD = "correct horse battery"
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     """Settings of functions at ``localhost`` with a provider at ``127.0.0.1``; a browser treats these as two sites."""
-    port = _free_port()
+    port = free_port()
     home = tmp_path_factory.mktemp("sign-in")
     url = f"http://localhost:{port}"
     with start_provider([new_key()], redirect=f"{url}/api/v1/auth/oidc/callback") as issuer:

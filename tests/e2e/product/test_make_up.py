@@ -12,8 +12,9 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.harness.browser.product import Machine, free_ports, moves, ready_link, run_module, start_machine
+from tests.harness.browser.product import PORTS, Machine, moves, ready_link, run_module, start_machine
 from tests.harness.network.brokers import BROKERS, MODULES, wait_until
+from tests.harness.network.ports import free_port
 
 
 def error_line(machine: Machine) -> str:
@@ -96,7 +97,7 @@ def test_a_killed_supervisor_leaves_no_processes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("offset", [0, 1, 2])
 def test_a_port_in_use_is_named(tmp_path: Path, offset: int) -> None:
-    port = free_ports()
+    port = free_port(PORTS)
     with socket.create_server(("127.0.0.1", port + offset)), start_machine(tmp_path, port=port) as machine:
         line = error_line(machine)
         assert f"port {port + offset}" in line

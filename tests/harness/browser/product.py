@@ -5,7 +5,6 @@ import json
 import os
 import re
 import signal
-import socket
 import ssl
 import subprocess
 import sys
@@ -23,6 +22,7 @@ from infra.local.__main__ import port_in_use
 from infra.mosquitto.configuration import binary
 from tests.harness.cloud.people import sign_in_link
 from tests.harness.network.brokers import Client, wait_until
+from tests.harness.network.ports import free_port
 from tests.harness.paths import ROOT
 
 START_WITHIN_S = 300.0
@@ -30,20 +30,8 @@ _ROW_BYTES = 500
 _COLUMNS = (("qpos", "joints"), ("qvel", "joints"), ("target", "actuators"), ("ctrl", "actuators"))
 
 
-def free_ports() -> int:
-    """First of five consecutive free ports."""
-    for _ in range(100):
-        with contextlib.ExitStack() as stack:
-            first = stack.enter_context(socket.socket())
-            first.bind(("127.0.0.1", 0))
-            port: int = first.getsockname()[1]
-            try:
-                for offset in (1, 2, 3, 4):
-                    stack.enter_context(socket.socket()).bind(("127.0.0.1", port + offset))
-            except (OSError, OverflowError):
-                continue
-            return port
-    raise AssertionError("no five free ports in a row")
+PORTS = 5
+"""Consecutive ports of the product: the server and its brokers."""
 
 
 @dataclass
@@ -195,7 +183,7 @@ def start_machine(home: Path, *, port: int = 0, **settings: str) -> Iterator[Mac
 
     Waits for the ready line or the end of the process.
     """
-    with start_program("infra.local", home, port or free_ports(), settings) as machine:
+    with start_program("infra.local", home, port or free_port(PORTS), settings) as machine:
         yield machine
 
 
@@ -251,9 +239,7 @@ def home_assistant(
     machine: Machine, folder: Path, key: str, *arguments: str
 ) -> Iterator[tuple["subprocess.Popen[str]", int]]:
     """The bridge to Home Assistant with an external mosquitto, and the port of that broker."""
-    with contextlib.closing(socket.socket()) as reserved:
-        reserved.bind(("127.0.0.1", 0))
-        port: int = reserved.getsockname()[1]
+    port = free_port()
     (folder / "mosquitto.conf").write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\n")
     command = [sys.executable, "-m", "infra.home_assistant", "--server", machine.url, "--port", str(port), *arguments]
     output = {"cwd": ROOT, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}

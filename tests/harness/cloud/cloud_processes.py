@@ -37,6 +37,7 @@ from tests.harness.agent.pinned_keys import pinned
 from tests.harness.cloud.cloud import Cloud, settings
 from tests.harness.hosts.host import Program, environment_of, start_program
 from tests.harness.network.brokers import HOST, BrokerKind, Client, Message, RunningBroker, start_broker, wait_until
+from tests.harness.network.ports import free_port
 from tests.harness.network.proxy import Proxy, start_proxy
 
 COMMAND_TTL_MS = 30_000
@@ -58,7 +59,7 @@ class Server:
     def __init__(
         self, environment: Mapping[str, str], stack: contextlib.ExitStack, launcher: Sequence[str] = ()
     ) -> None:
-        self.port = _free_port()
+        self.port = free_port()
         self._command = ["-m", *launcher, "function_app", "serve"]
         self._environment = environment_of({**environment, "TELESCOPE_PORT": str(self.port)})
         self._stack = stack
@@ -322,13 +323,6 @@ class _Rerouted(CloudClient):
 
     def _reroute(self, number: str) -> int:
         return self._ports.get(int(number), int(number))
-
-
-def _free_port() -> int:
-    with socket.socket() as listener:
-        listener.bind((HOST, 0))
-        port: int = listener.getsockname()[1]
-        return port
 
 
 def _listens(port: int) -> bool:

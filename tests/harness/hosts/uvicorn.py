@@ -8,12 +8,13 @@ from collections.abc import Iterator, Mapping
 
 from tests.harness.hosts.host import LOOPBACK, PATIENCE_S, Host, HostFailed, Program, environment_of, start_program
 from tests.harness.network.brokers import wait_until
+from tests.harness.network.ports import free_port
 
 
 @contextlib.contextmanager
 def start_uvicorn(environment: Mapping[str, str]) -> Iterator[Host]:
     """Start the server on a free port, and a worker that executes tasks on request."""
-    port = _free_port()
+    port = free_port()
     settings = environment_of({"TELESCOPE_HOST": LOOPBACK, **environment, "TELESCOPE_PORT": str(port)})
     with (
         start_program(["-m", "function_app", "serve"], settings) as server,
@@ -40,13 +41,6 @@ class _Uvicorn:
         error = json.loads(self._worker.read_line())
         if error:
             raise HostFailed(error)
-
-
-def _free_port() -> int:
-    with socket.socket() as listener:
-        listener.bind((LOOPBACK, 0))
-        port: int = listener.getsockname()[1]
-        return port
 
 
 def _listens(port: int) -> bool:

@@ -24,6 +24,7 @@ from device_agent.protocol.security import signing
 from device_agent.protocol.security.grants import Grant
 from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
 from function_app.ports.broker_access import BrokerAccess, Credentials
+from tests.harness.network.ports import free_port
 from tests.harness.paths import ROOT
 
 BrokerKind = Literal["amqtt", "mosquitto"]
@@ -312,7 +313,8 @@ def start_broker(
         launcher: Module and arguments of a program that runs the broker.
     """
     home.mkdir(parents=True, exist_ok=True)
-    ports = [*more, "--host", HOST, "--tcp-port", str(tcp_port), "--websocket-port", str(websocket_port)]
+    ports = [*more, "--host", HOST, "--tcp-port", str(tcp_port or free_port())]
+    ports += ["--websocket-port", str(websocket_port or free_port())]
     key = None
     if kind == "amqtt":
         key, own = _keys(home)

@@ -8,7 +8,6 @@ with open_site(...) as site:                        # functions, HTTP, Prosody a
 
 import asyncio
 import contextlib
-import random
 import socket
 import subprocess
 import sys
@@ -31,6 +30,7 @@ from tests.harness.cloud.cloud import Cloud, Person
 from tests.harness.cloud.cloud_processes import CloudProcesses, start_cloud_processes
 from tests.harness.hosts.host import environment_of, start_program
 from tests.harness.network.brokers import HOST, PATIENCE_S, Client, Message, RunningBroker, wait_until
+from tests.harness.network.ports import free_port
 from tests.harness.paths import ROOT
 
 if TYPE_CHECKING:
@@ -39,15 +39,6 @@ if TYPE_CHECKING:
     from function_app.entrypoints.xmpp.gateway import XmppGateway
 
 DOMAIN = "telescope.localhost"
-
-
-def free_port() -> int:
-    """A free port below those that Linux assigns, so that no other test receives it before it is used."""
-    while True:
-        port = random.randrange(10_000, 32_000)  # noqa: S311 (not a secret)
-        with socket.socket() as probe, contextlib.suppress(OSError):
-            probe.bind((HOST, port))
-            return port
 
 
 @dataclass
@@ -76,7 +67,7 @@ class Prosody:
 @contextlib.contextmanager
 def start_prosody(home: Path, verify_url: str, *, port: int = 0, more: tuple[str, ...] = ()) -> Iterator[Prosody]:
     home.mkdir(parents=True, exist_ok=True)
-    where = ("--home", str(home), "--port", str(port), "--websocket-port", "0")
+    where = ("--home", str(home), "--port", str(port or free_port()), "--websocket-port", str(free_port()))
     named = ("--domain", DOMAIN, "--verify-url", verify_url, *more)
     with (home / "stderr").open("a") as stderr:
         process = subprocess.Popen(

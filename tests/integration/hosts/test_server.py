@@ -17,6 +17,7 @@ from function_app.entrypoints.http.framework.responses import MAX_BODY
 from tests.conftest import Emulators
 from tests.harness.cloud.cloud import API, problem
 from tests.harness.network.brokers import PATIENCE_S, wait_until
+from tests.harness.network.ports import free_port
 from tests.harness.paths import ROOT
 from tests.harness.stores.aws import use_credentials
 from tests.harness.stores.emulators import empty_store
@@ -35,12 +36,6 @@ def start(home: Path, port: int, command: str) -> "subprocess.Popen[str]":
         stderr=subprocess.PIPE,
         text=True,
     )
-
-
-def free_port() -> int:
-    with socket.create_server((LOOPBACK, 0)) as found:
-        port: int = found.getsockname()[1]
-        return port
 
 
 def accepts_connections(port: int) -> bool:

@@ -7,6 +7,7 @@ from typing import Any, Self
 
 from function_app.ports.broker_access import Credentials
 from tests.harness.network.brokers import HOST, Client, Message, wait_until
+from tests.harness.network.ports import free_port
 
 USER, PASSWORD = "telescope", "correct-horse-battery"  # pragma: allowlist secret
 DEVICES = Credentials("devices", "another-secret-word")  # pragma: allowlist secret
@@ -29,9 +30,7 @@ class HouseBroker:
         users.touch(0o600)
         for name, password in ((USER, PASSWORD), DEVICES):
             subprocess.run(["mosquitto_passwd", "-b", users, name, password], check=True, capture_output=True)
-        with socket.socket() as free:
-            free.bind((HOST, 0))
-            self.port: int = free.getsockname()[1]
+        self.port = free_port()
         lines = [
             f"listener {self.port} {HOST}", "allow_anonymous false", f"password_file {users}", "user root",
             "log_dest stderr", "persistence false",

@@ -11,6 +11,7 @@ from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import SimData, SimDevice
 
 from tests.harness.network.brokers import HOST, PATIENCE_S
+from tests.harness.network.ports import free_port
 
 SIZE = 64
 """Number of addresses in each table; the next one is illegal."""
@@ -40,7 +41,7 @@ class ModbusPeer:
         self.fault: ExcCodes | None = None
         self.silent = self.ignore_writes = False
         self.requests: list[tuple[int, int, int]] = []
-        self.port = port
+        self.port = port or free_port()
         self.place: dict[str, Any] = {}
         self._path = path
         self._unit = unit
@@ -62,8 +63,6 @@ class ModbusPeer:
             server = ModbusTcpServer(unused, address=(HOST, self.port), **common)
         server.context = self
         await server.serve_forever(background=True)
-        if not self._path:
-            self.port = server.transport.sockets[0].getsockname()[1]
         self._ended = asyncio.Event()
         self._ready.set()
         await self._ended.wait()

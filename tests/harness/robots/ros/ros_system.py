@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from device_agent.protocol.manifests.robot_type import RobotType
+from tests.harness.network.ports import free_port
 
 PYTHON = "/usr/bin/python3"
 """The interpreter that has Debian's packages."""
@@ -32,8 +33,7 @@ class RosSystem:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            self._port: int = server.getsockname()[1]
+        self._port = free_port()
         self.uri = f"http://127.0.0.1:{self._port}"
         self.environment: Mapping[str, str] = {
             **{name: value for name, value in os.environ.items() if not name.startswith(("ROS", "PYTHON"))},

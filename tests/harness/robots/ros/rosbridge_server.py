@@ -12,6 +12,7 @@ from websockets.frames import Frame
 from websockets.http11 import Request
 from websockets.server import ServerProtocol
 
+from tests.harness.network.ports import free_port
 from tests.harness.robots.ros import definitions
 
 Receive = Callable[[str, Mapping[str, Any]], None]
@@ -40,8 +41,8 @@ class RosbridgeServer:
         self._ros = ros
         self._receive_goal = receive_goal
         self._clients: list[_Client] = []
-        self._server = _listen(0)
-        self.port: int = self._server.getsockname()[1]
+        self.port = free_port()
+        self._server = _listen(self.port)
         self.latched: dict[str, Any] = {}
         self.actions: dict[str, str] = {}
         self.errors: list[str] = []

@@ -11,6 +11,7 @@ from device_agent.drivers.ur.driver import ORDER
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.threads import SupervisedThread
 from device_agent.protocol.manifests.robot_type import RobotType
+from tests.harness.network.ports import free_port
 from tests.harness.robots.universal_robots.controller import CYCLE_S, NORMAL, PROTECTIVE_STOP, Controller
 from tests.harness.robots.universal_robots.dashboard_server import GREETING, DashboardSession
 from tests.harness.robots.universal_robots.rtde_server import RtdeServer, RtdeSession
@@ -33,7 +34,7 @@ class UrPeer:
         self._script_clients: dict[socket.socket, bytes] = {}
         self._dashboard_clients: dict[socket.socket, DashboardSession] = {}
         self.dashboard_commands: list[str] = []
-        self._servers = [self._listen(0), self._listen(0), self._listen(0)]
+        self._servers = [self._listen(free_port()) for _ in range(3)]
         self.rtde_port, self.script_port, self.dashboard_port = (server.getsockname()[1] for server in self._servers)
         self._stopping = threading.Event()
         self._thread = SupervisedThread(self._run, name="peer", part="peer", stopping=self._stopping)

@@ -4,7 +4,6 @@ import contextlib
 import logging
 import os
 import shutil
-import socket
 import sqlite3
 import sys
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.clock import CloudClock
 from tests.harness.network.http_server import QuietHandler, serve
+from tests.harness.network.ports import free_port
 
 ARM = DeviceEntry(name="arm", type="ur5")
 LIDAR = DeviceEntry(name="lidar", type="lidar", room="lab")
@@ -35,9 +35,7 @@ def store(tmp_path: Path) -> IdentityStore:
     """Enrolled but not paired; the server is unreachable."""
     store = IdentityStore(tmp_path / "agent")
     store.private_key(create=True)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        server = f"http://127.0.0.1:{free.getsockname()[1]}"
+    server = f"http://127.0.0.1:{free_port()}"
     AgentConfig(server=server, name="lab", devices=(ARM,)).save(store.folder)
     return store
 

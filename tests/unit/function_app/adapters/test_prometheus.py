@@ -4,7 +4,7 @@ import pytest
 
 from function_app.adapters.local.monitoring.prometheus import PrometheusMetrics
 from function_app.ports.monitoring import Counter, Histogram, NoMetrics
-from tests.harness.browser.product import free_ports
+from tests.harness.network.ports import free_port
 
 
 def lines(text: bytes) -> set[str]:
@@ -39,7 +39,7 @@ def test_a_gauge_keeps_no_value_that_is_gone() -> None:
 
 
 def test_a_worker_serves_its_metrics() -> None:
-    metrics, port = PrometheusMetrics(), free_ports()
+    metrics, port = PrometheusMetrics(), free_port()
     metrics.count(Counter.ACKS, "done")
     server = metrics.serve(port)
     try:
