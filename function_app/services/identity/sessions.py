@@ -183,7 +183,7 @@ class Sessions:
         now_ms = self._clock.now_ms()
         self._used_ms[caller.session] = now_ms
         self._used_ms.move_to_end(caller.session)
-        if len(self._used_ms) > _REMEMBERED_USES:
+        while len(self._used_ms) > _REMEMBERED_USES or now_ms - next(iter(self._used_ms.values())) >= USE_MS:
             self._used_ms.popitem(last=False)
 
         def used(session: Session | None) -> Session | None:

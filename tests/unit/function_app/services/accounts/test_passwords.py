@@ -247,6 +247,12 @@ class TestSessions:
         phone.get("/accounts/me")
         assert listed() == used, "the resolution is five minutes"
 
+    def test_only_recent_uses_stay_in_memory(self, cloud: Cloud) -> None:
+        for _ in range(3):
+            cloud.clock.advance(360)
+            assert cloud.sign_in("anna").get("/accounts/me").status_code == 200
+        assert len(cloud.functions.sessions._used_ms) == 1
+
     def test_recent_sign_ins_outlive_their_sessions(self, cloud: Cloud, anna: Person) -> None:
         first = sign_in(cloud, "anna", GOOD, address="192.0.2.9").json()
         second = Person(cloud, sign_in(cloud, "anna", GOOD, device_token=first["device_token"]).json())
