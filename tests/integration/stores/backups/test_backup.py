@@ -18,7 +18,7 @@ from function_app.adapters.local.tables import SqliteTables
 from function_app.ports.tables import Row
 from tests.harness.cloud.cloud import Cloud
 from tests.harness.cloud.cloud import settings as cloud_settings
-from tests.integration.stores.conftest import SOURCE, Run
+from tests.integration.stores.backups.conftest import SOURCE, Run
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from function_app import bootstrap, settings
 from function_app.domain.telemetry.recordings import RecordingRow, Segment
 from function_app.ports.tables import Row
 from function_app.services.storage import records
-from tests.integration.stores.conftest import Run
+from tests.integration.stores.backups.conftest import Run
 
 CONTENT, OVERVIEW = b"content", b"overview"
 PARTITION, FOLDER = "a-arm/pairing", "recordings/anna/a-arm/pairing"
