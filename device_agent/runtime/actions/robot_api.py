@@ -21,6 +21,9 @@ from device_agent.runtime.planning.motion_planner import MotionPlanner, quaterni
 from device_agent.runtime.planning.navigator import MAX_APPROACHES, SETTLE_UPDATES, UPDATE_PERIOD_S, Navigator
 from device_agent.runtime.readings import Reading
 
+UNSEEN_TIMEOUT_S = 5.0
+"""Time for which a robot rests while the room's sensors do not see it, for example because of a person [s]."""
+
 
 class RobotApi:
     """``RobotApiProtocol`` of one action.
@@ -189,6 +192,23 @@ class RobotApi:
         return pose
 
     def _pose(self, *, confirm: bool = False) -> Pose2D:
+        """The pose. If the room's sensors do not see the robot, it rests for a while: a person may stand before them.
+
+        Raises:
+            Refused: The pose stays unknown, or the room's sensors contradict it.
+        """
+        unseen_s = 0.0
+        while True:
+            try:
+                return self._estimate_pose(confirm=confirm)
+            except Refused as refused:
+                rest = self._context.controller.start_drive(self.reservation, REST, duration_s=UPDATE_PERIOD_S)
+                if refused.code != "no_position" or unseen_s >= UNSEEN_TIMEOUT_S:
+                    raise
+                unseen_s += UPDATE_PERIOD_S
+                self.wait_for(rest)
+
+    def _estimate_pose(self, *, confirm: bool) -> Pose2D:
         context = self._context
         room = context.readings.newest(POSITIONS, f"x_m.{context.name}")
         odometry = context.own_readings().get(ODOMETRY)
@@ -202,11 +222,7 @@ class RobotApi:
             obstacle_map = None if context.obstacle_map is None else context.obstacle_map()
             if obstacle_map is None:
                 raise Refused("no_ground", "no sensor reports the obstacles in the room; drive manually")
-            try:
-                pose = self._pose()
-            except Refused:
-                controller.start_drive(self.reservation, REST, duration_s=UPDATE_PERIOD_S)  # ends the last drive
-                raise
+            pose = self._pose()
             try:
                 twist, waited_s = navigator.compute_twist(pose, obstacle_map), 0.0
             except Refused as refused:
