@@ -191,8 +191,12 @@ class RobotApi:
             pose = self._pose(confirm=update == SETTLE_UPDATES)
         return pose
 
-    def _pose(self, *, confirm: bool = False) -> Pose2D:
+    def _pose(self, *, confirm: bool = False, on_rest: Callable[[], None] | None = None) -> Pose2D:
         """The pose. If the room's sensors do not see the robot, it rests for a while: a person may stand before them.
+
+        Args:
+            confirm: Whether the room must see the robot now.
+            on_rest: Called in each period of this rest.
 
         Raises:
             Refused: The pose stays unknown, or the room's sensors contradict it.
@@ -206,6 +210,8 @@ class RobotApi:
                 if refused.code != "no_position" or unseen_s >= UNSEEN_TIMEOUT_S:
                     raise
                 unseen_s += UPDATE_PERIOD_S
+                if on_rest is not None:
+                    on_rest()
                 self.wait_for(rest)
 
     def _estimate_pose(self, *, confirm: bool) -> Pose2D:
@@ -222,7 +228,7 @@ class RobotApi:
             obstacle_map = None if context.obstacle_map is None else context.obstacle_map()
             if obstacle_map is None:
                 raise Refused("no_ground", "no sensor reports the obstacles in the room; drive manually")
-            pose = self._pose()
+            pose = self._pose(on_rest=navigator.replan)
             try:
                 twist, waited_s = navigator.compute_twist(pose, obstacle_map), 0.0
             except Refused as refused:

@@ -74,6 +74,10 @@ class Navigator:
             return 0.0
         return START_TIMEOUT_S if refused.code == "taken" and not self._started else BLOCKED_TIMEOUT_S
 
+    def replan(self) -> None:
+        """Search the path anew in the next update: the robot has rested, and the room may have changed."""
+        self._path = []
+
     def compute_twist(self, pose: Pose2D, obstacle_map: ObstacleMap) -> Twist | None:
         """The next twist; ``None`` at the goal.
 

@@ -79,28 +79,40 @@ class CameraConsents:
             caller: Name of the account.
 
         Raises:
-            Refused: The account is not the owner, the decision is older than the present one, or a camera is unknown.
+            Refused: The account is not the owner, the decision is older than the present one, or a camera is unknown;
+                withdrawals of a decision with an unknown camera are in force nevertheless.
             JournalError: It cannot be stored. New consent is then not in force.
         """
         before = self.of(device)
         if not self._account or request.account != self._account:
             raise Refused("not_owner", "only the owner who paired this agent may decide what its cameras record")
-        unknown = sorted(set(request.cameras) - set(cameras))
-        if unknown:
-            names = ", ".join(sorted(cameras)) or "none"
-            raise Refused("unknown_camera", f"no camera '{unknown[0]}' can be recorded here; there are: {names}")
         if request.number == before.number and set(request.cameras) == set(before.cameras):
             return False  # a repetition
         if request.number <= before.number:
             raise Refused(
                 "outdated", f"decision {request.number} is older than decision {before.number} of this device"
             )
-        consent = CameraConsent(cameras=request.cameras, by=caller, at_ms=wall_ms(), number=request.number)
-        self._set(device, before, tuple(each for each in before.cameras if each in request.cameras))
+        kept = tuple(each for each in before.cameras if each in request.cameras)
+        unknown = sorted(set(request.cameras) - set(cameras))
+        if not unknown:
+            self._apply(device, before, kept, self._consent(request, request.cameras, caller))
+            return True
+        # The cloud may know cameras that were removed meanwhile. What the owner has withdrawn is not recorded any more.
+        if kept != before.cameras:
+            self._apply(device, before, kept, self._consent(request, kept, caller))
+        names = ", ".join(sorted(cameras)) or "none"
+        raise Refused("unknown_camera", f"no camera '{unknown[0]}' can be recorded here; there are: {names}")
+
+    @staticmethod
+    def _consent(request: SetCameraConsent, cameras: tuple[str, ...], caller: str) -> CameraConsent:
+        return CameraConsent(cameras=cameras, by=caller, at_ms=wall_ms(), number=request.number)
+
+    def _apply(self, device: str, before: CameraConsent, kept: tuple[str, ...], consent: CameraConsent) -> None:
+        """Withdraw all cameras except ``kept``, store the new consent, and put it into force."""
+        self._set(device, before, kept)
         stored = _Stored(space=self._space, account=self._account, consent=consent)
-        self._journal.save_camera_consent(device, request.number, msgspec.json.encode(stored))
-        self._set(device, consent, request.cameras)
-        return True
+        self._journal.save_camera_consent(device, consent.number, msgspec.json.encode(stored))
+        self._set(device, consent, consent.cameras)
 
     def _set(self, device: str, consent: CameraConsent, cameras: Collection[str]) -> None:
         now_s = time.monotonic()

@@ -23,6 +23,9 @@ from device_agent.runtime.recording.messages import Batch, Entry, RecordedFrame,
 
 AFTER_S = 5.0
 """Time for which a robot that still moves is recorded after the end of the lease [s]."""
+PAUSE_S = 1.0
+"""Time for which the session of an action without a lease continues after it [s]: a trial reserves the robot again
+after its script, and one action must not have two sessions."""
 MAX_QUEUED = 4096
 """Rows and other messages of one device that wait for the recorder process: half a minute at 125 Hz."""
 MAX_FRAMES = 16
@@ -117,7 +120,7 @@ class DeviceRecording:
         # Of the control loop.
         self._session: _Session | None = None
         self._sequence = 0
-        self._until_s = 0.0
+        self._until_s = self._paused_until_s = 0.0
         # Of the recorder's thread.
         self._taken: SegmentInfo | None = None
         self._failed = False
@@ -127,17 +130,19 @@ class DeviceRecording:
     # ------------------------------------------------------------ control loop
 
     def record_period(self, period: Period) -> None:
-        """Record one control period if a lease or an action is in force, or the robot still moves afterwards."""
+        """Record a control period if a lease or an action is in force, or has just ended and the robot still moves."""
         output = period.output
         epoch = output.epoch or (self._newest_epoch() if output.mode is Mode.ACTION else 0)
         if epoch:
             self._until_s = period.now_s + AFTER_S
+            self._paused_until_s = period.now_s + (0.0 if output.epoch else PAUSE_S)
             if self._session is None or self._session.epoch != epoch:
                 self._begin(epoch, period.now_s)
         session = self._session
         if session is None:
             return
-        if not epoch and (not period.moving or period.now_s >= self._until_s):
+        rested = not period.moving and period.now_s >= self._paused_until_s
+        if not epoch and (rested or period.now_s >= self._until_s):
             self.end()
             return
         if len(self._queue) < MAX_QUEUED:

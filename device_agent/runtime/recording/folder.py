@@ -5,9 +5,11 @@ cloud has both, and ``.live`` is a segment that is being written or that a crash
 """
 
 import contextlib
+import io
 import os
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,14 +53,14 @@ class RecordingFolder:
         """Delete recordings of a former owner. ``owner``: space and account of the present one.
 
         Raises:
-            OSError: They cannot be deleted.
+            OSError: They cannot be deleted, or the disk is full.
         """
         marker = self.folder / _OWNER
         if self.folder.is_dir() and (not marker.exists() or marker.read_text(encoding="utf-8") != owner):
             shutil.rmtree(self.folder)
         self.folder.mkdir(mode=FOLDER_MODE, exist_ok=True)
-        with contextlib.suppress(FileExistsError), os.fdopen(create(marker), "w", encoding="utf-8") as file:
-            file.write(owner)
+        if not marker.exists():
+            write_file(marker, lambda file: file.write(owner.encode()))
 
     def live_path(self, device: str, epoch: int, lowest: int) -> Path:
         """Path for a new segment after all others of the session, with the number ``lowest`` or a higher one.
@@ -173,3 +175,27 @@ def _size(path: Path) -> int:
         return path.stat().st_size
     except FileNotFoundError:  # it has been completed
         return 0
+
+
+def write_file(path: Path, write: Callable[[io.BufferedWriter], object]) -> None:
+    """Write a file completely or not at all, also if the machine loses power.
+
+    Raises:
+        OSError: The disk failed or is full.
+    """
+    temporary = path.with_name(f"{path.name}.new")
+    temporary.unlink(missing_ok=True)
+    try:
+        with os.fdopen(create(temporary), "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    descriptor = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -7,7 +7,7 @@ import contextlib
 import io
 import os
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -100,8 +100,8 @@ def seal(live: Path) -> None:
     sealed = live.with_suffix(".mcap")
     content = _read(live.read_bytes())
     if content.messages and not sealed.exists():
-        _write(folder.overview_of(sealed), lambda file: file.write(msgspec.json.encode(_overview(content))))
-        _write(sealed, lambda file: _write_segment(file, content))
+        folder.write_file(folder.overview_of(sealed), lambda file: file.write(msgspec.json.encode(_overview(content))))
+        folder.write_file(sealed, lambda file: _write_segment(file, content))
     live.unlink(missing_ok=True)
 
 
@@ -163,26 +163,6 @@ def _add_message(content: _Content, message: Message) -> None:
     else:
         msgspec.json.decode(message.data)
     content.messages.append(message)
-
-
-def _write(path: Path, write: Callable[[io.BufferedWriter], object]) -> None:
-    """Write a file completely or not at all."""
-    temporary = path.with_name(f"{path.name}.new")
-    temporary.unlink(missing_ok=True)
-    try:
-        with os.fdopen(folder.create(temporary), "wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    descriptor = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _write_segment(file: io.BufferedWriter, content: _Content) -> None:

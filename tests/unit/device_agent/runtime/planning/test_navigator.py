@@ -131,6 +131,15 @@ def test_an_occupied_goal_has_a_short_timeout_before_the_start() -> None:
     assert navigator.timeout_s(taken) == BLOCKED_TIMEOUT_S
 
 
+def test_after_a_rest_the_path_is_searched_anew() -> None:
+    navigator, start, wall = navigator_to((1.0, 0.0)), Pose2D(0.0, 0.0, 0.0), room((0.5, -3.0, 0.7, 3.0))
+    navigator.compute_twist(start, room())
+    assert navigator.compute_twist(start, wall) is not None, "not in each update"
+    navigator.replan()
+    with refuses("no_way"):
+        navigator.compute_twist(start, wall)
+
+
 def test_at_the_goal_the_robot_only_turns() -> None:
     navigator = navigator_to((0.0, 0.0), 1.0)
     twist = navigator.compute_twist(Pose2D(0.01, 0.0, 0.0), room())

@@ -92,6 +92,14 @@ def test_an_unknown_camera_is_named(consents: CameraConsents) -> None:
         consents.decide("arm", (), request, caller="ann")
 
 
+def test_a_withdrawal_is_in_force_although_a_camera_is_unknown(consents: CameraConsents, journal: Journal) -> None:
+    decide(consents, 1, "front", "wrist")
+    assert code(consents, 2, "wrist", "removed") == "unknown_camera"
+    assert permitted(consents) == ["wrist"]
+    assert permitted(CameraConsents(journal, space=SPACE, account=OWNER)) == ["wrist"]
+    assert code(consents, 1, "front", "wrist") == "outdated"
+
+
 def test_a_restart_keeps_the_decision(consents: CameraConsents, journal: Journal) -> None:
     decide(consents, 4, "front")
     restarted = CameraConsents(journal, space=SPACE, account=OWNER)

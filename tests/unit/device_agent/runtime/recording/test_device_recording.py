@@ -52,10 +52,20 @@ def test_without_an_operator_a_row_has_no_setpoint(recorded: Recorded, mode: Mod
 def test_an_action_without_a_lease_is_recorded(recorded: Recorded) -> None:
     recorded.action_epoch = 9
     recorded.run(2, mode=Mode.ACTION, epoch=0)
-    recorded.run(epoch=0)
-    batch = recorded.take()[0]
+    assert [row.mode for row in recorded.rows()] == [Mode.ACTION] * 2
+    recorded.run(round(module.PAUSE_S / 0.008) + 1, epoch=0)
+    batch = recorded.take()[-1]
     assert batch.session is not None
-    assert (batch.session.epoch, len(batch.rows), batch.ended) == (9, 2, True)
+    assert (batch.session.epoch, batch.ended) == (9, True)
+
+
+def test_a_pause_within_an_action_does_not_split_the_session(recorded: Recorded) -> None:
+    recorded.action_epoch = 9
+    recorded.run(2, mode=Mode.ACTION, epoch=0)
+    recorded.run(3, epoch=0)
+    recorded.run(2, mode=Mode.ACTION, epoch=0)
+    (batch,) = recorded.take()
+    assert ([row.sequence for row in batch.rows], batch.ended) == ([0, 1, 2, 3, 4, 5, 6], False)
 
 
 def test_a_moving_robot_is_recorded_until_it_rests(recorded: Recorded) -> None:
