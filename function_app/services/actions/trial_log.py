@@ -24,6 +24,8 @@ KEEP_MS: Final = 730 * DAY_MS
 """Time that trials are stored [ms]."""
 _NOT_REPORTED: Final = "The device did not report a verdict."
 _CONCURRENT_READS: Final = 16
+_MAX_PAGE: Final = 1_000
+"""Most rows that one query of a table returns."""
 
 
 class TrialLog:
@@ -67,9 +69,13 @@ class TrialLog:
     async def _page(self, device: Device, after: str, limit: int) -> Sequence[Row]:
         rows: list[Row] = []
         partition, first = f"{device.id}/{device.pairing}", after + "\0" if after else ""
-        async for row in records.all_rows(self._tables, records.TRIALS, partition, first=first):
-            rows.append(row)
-            if len(rows) == limit:
+        cursor = None
+        while len(rows) < limit:
+            size = min(limit - len(rows), _MAX_PAGE)
+            page = await self._tables.query(records.TRIALS, partition, first=first, limit=size, cursor=cursor)
+            rows += page.rows
+            cursor = page.cursor
+            if cursor is None:
                 break
         return rows
 

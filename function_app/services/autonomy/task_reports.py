@@ -16,6 +16,8 @@ from function_app.services.storage.retention import DAY_MS
 
 MAX_TRIALS: Final = 5_000
 """Trials that one request evaluates, newest first."""
+READ_SIZE: Final = 1_000
+"""Trials of one read of a list. The limit of the caller would make a rare filter read very many pages."""
 MAX_BATCHES: Final = 50
 """Batches in one report, newest first."""
 _CURSOR_LENGTH: Final = 64
@@ -86,7 +88,7 @@ class TaskReports:
         found: list[Trial] = []
         after, seen = cursor or "", 0
         while seen < MAX_TRIALS:
-            page = await self._trial_log.read(devices, after=after, limit=limit)
+            page = await self._trial_log.read(devices, after=after, limit=READ_SIZE)
             for trial in page:
                 after = key_of(trial)
                 seen += 1
@@ -94,7 +96,7 @@ class TaskReports:
                     found.append(trial)
                     if len(found) == limit:
                         return found, after
-            if len(page) < limit:
+            if len(page) < READ_SIZE:
                 return found, None
         return found, after
 

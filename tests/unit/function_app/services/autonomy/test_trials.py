@@ -1,5 +1,6 @@
 """Trials of tasks: what is stored about them, and their success rates."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -8,6 +9,8 @@ from device_agent.protocol import AckStatus, Reason, RunTrial
 from device_agent.protocol.manifests import tasks
 from device_agent.protocol.manifests.shipped import ROBOTS
 from function_app.domain.actions.action import LOST
+from function_app.domain.actions.trials import Trial
+from function_app.ports.tables import Row
 from function_app.services.autonomy import task_reports
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
@@ -234,6 +237,28 @@ def test_trials_are_listed_in_pages_across_devices_and_filtered(cloud: Cloud, an
     problem(anna.get(TRIALS, params={"device": "none"}), 404, "device-unknown")
 
 
+def test_a_rare_filter_with_a_small_limit_reads_few_pages(
+    cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish(anna, robot, begin(anna, robot)["id"], SUCCESS)
+    plant_copies(cloud, robot, 1_200)
+    sizes = count_reads(cloud, monkeypatch)
+    assert anna.get(TRIALS, params={"state": "unknown", "limit": 1}).json()["items"] == []
+    assert sizes == [task_reports.READ_SIZE] * 2
+
+
+def test_a_report_asks_for_no_more_rows_than_it_evaluates(
+    cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish(anna, robot, begin(anna, robot)["id"], SUCCESS)
+    plant_copies(cloud, robot, 1_200)
+    monkeypatch.setattr(task_reports, "MAX_TRIALS", 1_050)
+    sizes = count_reads(cloud, monkeypatch)
+    body = report(anna)
+    assert (body["rate"]["trials"], body["complete"]) == (1_050, False)
+    assert [size for size in sizes if size != task_reports.MAX_BATCHES] == [1_000, 51]
+
+
 def test_older_trials_are_left_out_of_a_report_that_says_so(
     cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -297,3 +322,27 @@ def partition_of(cloud: Cloud, robot: Robot) -> str:
 
 def rows(cloud: Cloud, robot: Robot) -> tuple[Any, ...]:
     return tuple(cloud.run(cloud.functions.tables.query(records.TRIALS, partition_of(cloud, robot))).rows)
+
+
+def plant_copies(cloud: Cloud, robot: Robot, count: int) -> None:
+    """Store older copies of the robot's only trial."""
+    (row,) = rows(cloud, robot)
+    trial = records.read(row, Trial)
+    for index in range(count):
+        key = f"{row.key}{index:04}"
+        copy = records.to_data(replace(trial, action=key))
+        cloud.run(cloud.functions.tables.create(records.TRIALS, Row(row.partition, key, copy)))
+
+
+def count_reads(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The page size of each query of the table of trials from now on."""
+    sizes: list[int] = []
+    query = cloud.functions.tables.query
+
+    async def counted(table: str, partition: str, **options: Any) -> Any:
+        if table == records.TRIALS:
+            sizes.append(options["limit"])
+        return await query(table, partition, **options)
+
+    monkeypatch.setattr(cloud.functions.tables, "query", counted)
+    return sizes
