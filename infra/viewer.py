@@ -1,5 +1,6 @@
 """Connection of programs that show what an account may view: HTTP API, and the broker with a view grant."""
 
+import logging
 import ssl
 import threading
 from collections.abc import Callable
@@ -17,6 +18,8 @@ _POLL_S = 0.25
 _RENEW_SHARE = 0.8
 """Credentials are renewed after this share of their lifetime."""
 _PAGE = 100
+
+_log = logging.getLogger(__name__)
 
 Receive = Callable[[str, bytes], None]
 """Processes a message: topic, content. It runs in the thread of the connection and must not block."""
@@ -121,20 +124,40 @@ def watch(
     Args:
         telescope: Client of the HTTP API.
         credentials: Result of ``Telescope.view_credentials``.
-        receive: Processes each message.
+        receive: Processes each message. An exception from it is logged and ends the connection.
         stopping: Ends the connection when it is set.
         connected: Called when all topics are requested.
 
     Raises:
-        OSError: The broker cannot be reached, rejects the credentials, or ended the connection.
+        OSError: The broker cannot be reached, rejects the credentials, or ended the connection, or ``receive`` failed.
         ValueError: The server uses TLS, but the broker does not.
     """
     lost = threading.Event()
-    client = mqtt.Client(CallbackAPIVersion.VERSION2, credentials["client_id"], reconnect_on_failure=False)
-    client.username_pw_set(credentials["username"], credentials["password"])
+    client = _client(credentials, receive, lost, connected)
     tls = telescope.tls(credentials)
     if tls is not None:
         client.tls_set_context(tls)
+    client.connect(credentials["tcp"]["host"], credentials["tcp"]["port"])
+    client.loop_start()
+    try:
+        waited_s = 0.0
+        while not (stopping.is_set() or lost.is_set()) and waited_s < credentials["lifetime_s"] * _RENEW_SHARE:
+            stopping.wait(_POLL_S)
+            waited_s += _POLL_S
+        was_lost = lost.is_set()  # read before the own disconnect, which sets it too
+    finally:
+        client.disconnect()
+        client.loop_stop()
+    if was_lost and not stopping.is_set():
+        raise OSError("the connection to the broker was lost")
+
+
+def _client(
+    credentials: dict[str, Any], receive: Receive, lost: threading.Event, connected: Callable[[], None]
+) -> mqtt.Client:
+    """An MQTT client that sets ``lost`` when its connection ends or a message cannot be processed."""
+    client = mqtt.Client(CallbackAPIVersion.VERSION2, credentials["client_id"], reconnect_on_failure=False)
+    client.username_pw_set(credentials["username"], credentials["password"])
 
     def on_connect(client: mqtt.Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
         if code.is_failure:
@@ -144,18 +167,14 @@ def watch(
             client.subscribe(topic, 0)
         connected()
 
+    def on_message(_client: mqtt.Client, _data: object, message: mqtt.MQTTMessage) -> None:
+        try:
+            receive(message.topic, bytes(message.payload))
+        except Exception:  # noqa: BLE001 (it would end the client's thread, and nothing would be received any more)
+            _log.exception("%s: the message could not be processed", message.topic)
+            lost.set()
+
     client.on_connect = on_connect
     client.on_disconnect = lambda *_: lost.set()
-    client.on_message = lambda _client, _data, message: receive(message.topic, bytes(message.payload))
-    client.connect(credentials["tcp"]["host"], credentials["tcp"]["port"])
-    client.loop_start()
-    try:
-        waited_s = 0.0
-        while not (stopping.is_set() or lost.is_set()) and waited_s < credentials["lifetime_s"] * _RENEW_SHARE:
-            stopping.wait(_POLL_S)
-            waited_s += _POLL_S
-    finally:
-        client.disconnect()
-        client.loop_stop()
-    if lost.is_set() and not stopping.is_set():
-        raise OSError("the connection to the broker was lost")
+    client.on_message = on_message
+    return client

@@ -77,8 +77,9 @@ class Endpoint:
                     self._image(name, device, topic.name, frame)
 
     def _joints(self, name: str, device: _Device, description: Description, telemetry: JointTelemetry) -> None:
-        device.offset_ms = telemetry.at_ms - telemetry.tick_ms
         states = messages.joint_states(description, telemetry)
+        # Set only now: a time that is refused must not give images a wrong time.
+        device.offset_ms = telemetry.at_ms - telemetry.tick_ms
         self._channel(name, device, "joint_states").log(states, log_time=_ns(telemetry.at_ms))
         if telemetry.frames:
             transforms = messages.frame_transforms(name, description, telemetry)
@@ -97,4 +98,5 @@ class Endpoint:
 
 
 def _ns(at_ms: int) -> int:
+    """A time in ns. ``messages.timestamp`` has checked it, so that Foxglove can express it."""
     return at_ms * 1_000_000

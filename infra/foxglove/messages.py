@@ -21,16 +21,24 @@ from foxglove.messages import (
 
 from device_agent.protocol import Description, Event, JointTelemetry
 from device_agent.protocol.camera_frames import CameraFrame
+from device_agent.protocol.errors import ProtocolError
 
 BASE: Final = "base"
 """Name of the frame of a robot's base, after the id of the device."""
 _LEVELS: Final = {"info": LogLevel.Info, "warning": LogLevel.Warning, "error": LogLevel.Error}
 _MS_PER_S: Final = 1000
 _NS_PER_MS: Final = 1_000_000
+_END_MS: Final = 2**32 * _MS_PER_S
+"""First time that Foxglove cannot express [ms since 1970]: its seconds have 32 bits and no sign."""
 
 
 def joint_states(description: Description, telemetry: JointTelemetry) -> JointStates:
-    """Positions, velocities and efforts of all joints, with the names of the description."""
+    """Positions, velocities and efforts of all joints, with the names of the description.
+
+    Raises:
+        ProtocolError: Foxglove cannot express the time.
+        ValueError: The number of positions is not that of the joints.
+    """
     count = len(description.joints)
     velocities = _measured(telemetry.velocity_rad_s, count)
     efforts = _measured(telemetry.effort_nm, count)
@@ -45,7 +53,12 @@ def joint_states(description: Description, telemetry: JointTelemetry) -> JointSt
 
 
 def frame_transforms(device: str, description: Description, telemetry: JointTelemetry) -> FrameTransforms:
-    """Poses of the robot's frames relative to its base."""
+    """Poses of the robot's frames relative to its base.
+
+    Raises:
+        ProtocolError: Foxglove cannot express the time.
+        ValueError: The number of poses is not that of the frames.
+    """
     transforms = []
     for name, (x, y, z, qw, qx, qy, qz) in zip(description.frames, telemetry.frames, strict=True):
         transforms.append(
@@ -61,12 +74,16 @@ def frame_transforms(device: str, description: Description, telemetry: JointTele
 
 
 def compressed_image(frame_id: str, frame: CameraFrame, at_ms: int) -> CompressedImage:
-    """A JPEG image of a camera."""
+    """A JPEG image of a camera, taken at ``at_ms`` [ms since 1970].
+
+    Raises:
+        ProtocolError: Foxglove cannot express the time.
+    """
     return CompressedImage(timestamp=timestamp(at_ms), frame_id=frame_id, data=frame.content, format="jpeg")
 
 
 def log(device: str, event: Event) -> Log:
-    """An event of a device as log message."""
+    """An event of a device as log message. Raises ``ProtocolError``: Foxglove cannot express the time."""
     return Log(
         timestamp=timestamp(event.at_ms),
         level=_LEVELS[event.severity],
@@ -76,7 +93,13 @@ def log(device: str, event: Event) -> Log:
 
 
 def timestamp(at_ms: int) -> Timestamp:
-    """A wall-clock time [ms since 1970]."""
+    """A wall-clock time [ms since 1970].
+
+    Raises:
+        ProtocolError: The time is before 1970 or after 2106, which Foxglove cannot express.
+    """
+    if not 0 <= at_ms < _END_MS:
+        raise ProtocolError(f"the time {at_ms} ms is before 1970 or after 2106")
     return Timestamp(sec=at_ms // _MS_PER_S, nsec=at_ms % _MS_PER_S * _NS_PER_MS)
 
 

@@ -4,6 +4,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -24,6 +25,7 @@ from device_agent.protocol import (
     topics,
 )
 from device_agent.protocol.camera_frames import CameraFrame
+from infra import viewer
 from infra.foxglove.endpoint import Endpoint
 from tests.contract.exports.foxglove_client import FoxgloveClient, SchemaError
 from tests.fakes.agent import Robot
@@ -60,8 +62,8 @@ def telemetry(**changes: Any) -> JointTelemetry:
     return JointTelemetry(**values | changes)
 
 
-def event(message: str) -> Event:
-    return Event(id="e1", device="arm", at_ms=AT_MS, kind="motion-held", severity="warning", message=message)
+def event(message: str, at_ms: int = AT_MS) -> Event:
+    return Event(id="e1", device="arm", at_ms=at_ms, kind="motion-held", severity="warning", message=message)
 
 
 def frame(kind: str = camera_frames.COLOUR) -> bytes:
@@ -185,6 +187,44 @@ def test_other_devices_other_frames_and_invalid_messages_are_left_out(
     assert all(record.levelname == "WARNING" for record in caplog.records)
 
 
+@pytest.mark.parametrize("at_ms", [-1, 2**32 * 1_000, 2**53 - 1])
+def test_times_that_foxglove_cannot_express_are_left_out(
+    endpoint: LocalEndpoint, caplog: pytest.LogCaptureFixture, at_ms: int
+) -> None:
+    with subscribed(endpoint) as client:
+        endpoint.send(topics.TELE, telemetry(at_ms=at_ms), topics.JOINTS)
+        endpoint.send(topics.EVENT, event("wrong", at_ms))
+        assert [record.levelname for record in caplog.records] == ["WARNING", "WARNING"]
+        endpoint.send(topics.CAM, frame(), "wrist")
+        endpoint.send(topics.EVENT, event("after"))
+        client.receive(lambda: client.received["/a-arm/events"][-1].message == "after", "the last event")
+        assert all(log.message != "wrong" for log in client.received["/a-arm/events"])
+        image = client.received["/a-arm/cam/wrist"][-1]
+    assert image.timestamp.ToMilliseconds() == AT_MS + 40, "the refused time must not move the images"
+
+
+@pytest.mark.parametrize(("at_ms", "tick_ms"), [(AT_MS, 2**42), (0, 0)], ids=["after-2106", "before-1970"])
+def test_an_image_whose_time_foxglove_cannot_express_is_left_out(
+    endpoint: LocalEndpoint, caplog: pytest.LogCaptureFixture, at_ms: int, tick_ms: int
+) -> None:
+    endpoint.send(topics.TELE, telemetry(at_ms=at_ms), topics.JOINTS)
+    image = camera_frames.encode(CameraFrame(1, tick_ms, 64, 48, JPEG, camera_frames.COLOUR))
+    endpoint.send(topics.CAM, image, "wrist")
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+
+
+@pytest.mark.parametrize("at_ms", [0, 2**32 * 1_000 - 1])
+def test_the_first_and_the_last_time_are_published(
+    endpoint: LocalEndpoint, caplog: pytest.LogCaptureFixture, at_ms: int
+) -> None:
+    with subscribed(endpoint) as client:
+        endpoint.send(topics.EVENT, event("limit", at_ms))
+        client.receive(lambda: client.received["/a-arm/events"][-1].message == "limit", "the event")
+        assert client.received["/a-arm/events"][-1].timestamp.ToMilliseconds() == at_ms
+    assert not caplog.records
+
+
 # ------------------------------------------------------------ the program
 
 
@@ -256,6 +296,32 @@ def test_a_viewer_sees_the_robot_until_the_share_ends(processes: CloudProcesses,
         assert process.wait(60) == 4
         assert process.stderr is not None
         assert f"this account may not view {robot.device}" in process.stderr.read()
+
+
+@pytest.mark.usefixtures("robot")
+def test_an_unexpected_error_of_the_receiver_is_logged_and_ends_the_connection(
+    processes: CloudProcesses, caplog: pytest.LogCaptureFixture
+) -> None:
+    telescope = viewer.Telescope(processes.url, api_key(processes.anna))
+    credentials = telescope.view_credentials() | {"lifetime_s": 20}
+
+    def receive(_topic: str, _payload: bytes) -> None:
+        raise OverflowError("planted")
+
+    with pytest.raises(OSError, match="the connection to the broker was lost"):
+        viewer.watch(telescope, credentials, receive, threading.Event(), lambda: None)
+    logged = [record for record in caplog.records if record.exc_info and "planted" in str(record.exc_info[1])]
+    assert logged
+    assert logged[0].levelname == "ERROR"
+
+
+@pytest.mark.usefixtures("robot")
+def test_a_connection_whose_credentials_expire_ends_without_an_error(processes: CloudProcesses) -> None:
+    telescope = viewer.Telescope(processes.url, api_key(processes.anna))
+    credentials = telescope.view_credentials() | {"lifetime_s": 2}
+    connected = threading.Event()
+    viewer.watch(telescope, credentials, lambda *_: None, threading.Event(), connected.set)
+    assert connected.is_set()
 
 
 @pytest.mark.parametrize("options", [[], ["--device"]], ids=["all", "one"])
