@@ -6,8 +6,9 @@ written before the sum is compared with the limit: concurrent requests may both 
 
 import logging
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from function_app.domain.common.problems import Problem
 from function_app.ports.clock import Clock
@@ -28,8 +29,8 @@ class StorageLimits:
     """Limits of stored data.
 
     Attributes:
-        account_bytes: Captures of all devices, scripts and robot types of an account.
-        device_bytes: Captures of a device.
+        account_bytes: Captures and recordings of all devices, scripts and robot types of an account.
+        device_bytes: Captures and recordings of a device.
         series_bytes: Received measurements of a device in a day (UTC), counted by each process.
         min_free_bytes: Free disk space that remains for control: commands, leases, events and the audit log.
     """
@@ -42,7 +43,7 @@ class StorageLimits:
 
 @dataclass(slots=True)
 class Usage:
-    """Stored bytes of an account, and of its devices with captures."""
+    """Stored bytes of an account, and of its devices with captures or recordings."""
 
     total_bytes: int = 0
     device_bytes: dict[str, int] = field(default_factory=lambda: defaultdict(int))
@@ -75,22 +76,32 @@ class StorageQuota:
         Raises:
             Problem: ``storage-full``, ``quota-exceeded``.
         """
+        await self.reserve_all(account, {blob: size}, device=device)
+
+    async def reserve_all(self, account: str, sizes: Mapping[str, int], *, device: str = "") -> None:
+        """Like ``reserve``, for blobs that are admitted or rejected together, with their sizes [bytes].
+
+        Raises:
+            Problem: ``storage-full``, ``quota-exceeded``.
+        """
+        size = sum(sizes.values())
         if self._disk_is_full(size):
             detail = "The server's disk is almost full. Robots can be operated, but no data is stored. Free disk space."
             raise Problem("storage-full", 507, "The disk is full", detail)
-        await records.upsert(
-            self._tables, records.USAGE, account, blob, lambda _: {"bytes": size, "device": device}, dict
-        )
+        for blob, length in sizes.items():
+            await self._count(account, blob, {"bytes": length, "device": device})
         usage = await self.usage(account)
         for used_bytes, limit_bytes, owner in (
             (usage.total_bytes, self.limits.account_bytes, "this account"),
             (usage.device_bytes[device] if device else 0, self.limits.device_bytes, "this device"),
         ):
             if used_bytes > limit_bytes:
-                await release(self._tables, account, blob)
+                for blob in sizes:
+                    await release(self._tables, account, blob)
                 detail = (
                     f"{size / MB:.1f} MB do not fit: {(used_bytes - size) / MB:.1f} MB of the {limit_bytes / MB:.0f} "
-                    f"MB for {owner} are in use. Delete captures, movements or robot types that are not needed."
+                    f"MB for {owner} are in use. Delete captures, recordings, movements or robot types that are not "
+                    "needed."
                 )
                 extras = {"used_bytes": used_bytes - size, "limit_bytes": limit_bytes}
                 raise Problem("quota-exceeded", 413, "No storage left", detail, extras=extras)
@@ -107,6 +118,9 @@ class StorageQuota:
             cursor = page.cursor
             if cursor is None:
                 return result
+
+    async def _count(self, account: str, blob: str, data: dict[str, Any]) -> None:
+        await records.upsert(self._tables, records.USAGE, account, blob, lambda _: data, dict)
 
     def refuse_measurement(self, device: str, size: int) -> str:
         """Count a measurement; returns the reason if it cannot be stored, otherwise an empty string."""
