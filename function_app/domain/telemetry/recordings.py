@@ -1,8 +1,8 @@
 """Recordings of sessions: their segments and episodes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Final, Literal
 
 from function_app.domain.common.problems import invalid
@@ -10,6 +10,13 @@ from function_app.domain.telemetry.sessions import Session
 
 TOLERANCE_S: Final = 10.0
 """A recording continues until the robot rests, and agents learn of the end of a session later than the cloud [s]."""
+
+MIN_SEGMENT_S: Final = 1.0
+"""Agents begin a segment each minute, and earlier if it is large or the disk was full, but not more often [s]."""
+SPARE_SEGMENTS: Final = 1_000
+"""Further numbers that are accepted, because clocks differ and restarts of an agent begin segments."""
+MAX_MISSING: Final = 1_000
+"""Most missing segments that are listed: a gap may be much longer than the list of stored segments."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,6 +134,20 @@ def duration_s(session: Session, segments: Sequence[Segment], *, now_ms: int) ->
     return max(lasted_ms, _recorded_ms(segments)) / 1000
 
 
+def check_numbers(session: Session, numbers: Iterable[int], *, now_ms: int) -> None:
+    """Refuse numbers of segments that the session cannot have reached.
+
+    Raises:
+        Problem: ``invalid``.
+    """
+    lasted_s = max(0, now_ms - session.started_ms) / 1000
+    last = int(lasted_s / MIN_SEGMENT_S) + SPARE_SEGMENTS
+    number = max(numbers, default=0)
+    if number > last:
+        began = f"Session {session.epoch} began {lasted_s:.0f} s ago"
+        raise invalid(f"{began} and cannot have segment {number}. Send a number up to {last}.")
+
+
 def is_complete(session: Session, segments: Sequence[Segment]) -> bool:
     """Whether a session has ended and its stored segments cover it without a gap."""
     if not session.ended_ms or [each.segment for each in segments] != list(range(len(segments))):
@@ -150,11 +171,12 @@ class Missing:
 
 
 def missing_segments(segments: Sequence[Segment]) -> tuple[Missing, ...]:
-    """The segments that are not stored although a later one is, or the agent will upload them."""
+    """The first ``MAX_MISSING`` segments that are not stored although a later one is, or the agent will upload them."""
     pending = _pending(segments)
     stored = {each.segment for each in segments}
     waiting = set(pending or ()) - stored
-    absent = sorted(set(range(max(stored | waiting, default=-1) + 1)) - stored)
+    numbers = range(max(stored | waiting, default=-1) + 1)
+    absent = islice((number for number in numbers if number not in stored), MAX_MISSING)
 
     def cause(number: int) -> Literal["waiting", "lost", "unknown"]:
         return "waiting" if number in waiting else "unknown" if pending is None else "lost"
@@ -167,8 +189,9 @@ def is_final(session: Session, segments: Sequence[Segment]) -> bool:
     if is_complete(session, segments):
         return True
     stored_ms = max((each.stored_ms for each in segments), default=0)
-    named = _pending(segments) is not None and all(each.cause == "lost" for each in missing_segments(segments))
-    return named and 0 < session.ended_ms <= stored_ms
+    pending = _pending(segments)
+    uploaded = pending is not None and {each.segment for each in segments}.issuperset(pending)
+    return uploaded and 0 < session.ended_ms <= stored_ms
 
 
 def _pending(segments: Sequence[Segment]) -> tuple[int, ...] | None:

@@ -10,14 +10,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NoReturn
 
+import msgspec
+
 from function_app.domain.common.ids import new_suffix
 from function_app.domain.common.problems import Problem, invalid, not_found
 from function_app.domain.devices.devices import Device
-from function_app.domain.telemetry.recordings import Episode, RecordingRow, Segment
+from function_app.domain.telemetry.recordings import Episode, RecordingRow, Segment, check_numbers
+from function_app.domain.telemetry.sessions import Session
 from function_app.ports import blobs as port
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
-from function_app.ports.tables import Conflict, Row, Tables
+from function_app.ports.tables import MAX_DATA_BYTES, Conflict, Row, Tables
 from function_app.services.storage import quota, records
 from function_app.services.storage.quota import StorageQuota
 from function_app.services.storage.retention import DAY_MS, Retention
@@ -32,6 +35,10 @@ _SLACK_MS: Final = 600_000
 MCAP, JSON = "application/octet-stream", "application/json"
 _KEEP_MS: Final = KEEP_SESSIONS_MS + DAY_MS
 """A recording is deleted a day after its session, or earlier by its owner."""
+_DELETION_MS: Final = 600_000
+"""Retention completes the deletion of a recording after this time, which is longer than a request lasts [ms]."""
+_MAX_EPISODES_BYTES: Final = MAX_DATA_BYTES - 1_024
+"""Size of the episodes as JSON [bytes]. The rest of their row is for its other fields."""
 _CHANGED: Final = "The episodes were changed since they were read. Read them again, and repeat the change."
 
 
@@ -82,8 +89,8 @@ class Recordings:
         """
         if announced.ended_ms < announced.started_ms:
             raise invalid("A segment ends after its start.")
-        if not await self._has_session(device, announced.epoch):
-            raise not_found("session", str(announced.epoch))
+        session = await self._session(device, announced.epoch)
+        check_numbers(session, [announced.segment], now_ms=self._clock.now_ms())
         recording = await self._recording(device, announced.epoch)
         if recording is not None and recording.deleted:
             return None
@@ -115,17 +122,25 @@ class Recordings:
         ``pending``: the other segments of the session that the agent will upload; ``None``: it has not named them.
 
         Raises:
-            Problem: ``segment-unknown``, ``upload-missing``, ``upload-mismatch``, ``busy``.
+            Problem: ``segment-unknown`` (also if its recording was deleted; then the segment is deleted too),
+                ``session-unknown``, ``invalid``, ``upload-missing``, ``upload-mismatch``, ``busy``.
         """
         _, segment = await self._find(device, epoch, number)
         if segment is None or self._expires_soon(segment):
             raise not_found("segment", f"{epoch}/{number}")
         if segment.state == "stored":
             return segment
+        if pending:
+            check_numbers(await self._session(device, epoch), pending, now_ms=self._clock.now_ms())
         await self._check(segment.blob, segment.length, segment.sha256)
         await self._check(segment.overview_blob, segment.overview_length, segment.overview_sha256)
         # Before the segment is stored: nothing repeats it after a kill in between.
-        await self._change(device, epoch, lambda recording: replace(recording, recorded=not recording.deleted))
+        recording = await self._change(device, epoch, lambda each: replace(each, recorded=not each.deleted))
+        if recording.deleted:
+            # It was announced while the recording was being deleted. The agent's next announcement is answered with
+            # ``stored``, so that it does not upload the segment again.
+            await self._remove(device, segment)
+            raise not_found("segment", f"{epoch}/{number}")
         now_ms = self._clock.now_ms()
         stored = replace(segment, state="stored", pending=pending, stored_ms=now_ms, expires_ms=now_ms + _KEEP_MS)
         await self._schedule_deletion(device, stored)
@@ -145,12 +160,8 @@ class Recordings:
         )
 
     async def _reserve(self, device: Device, segment: Segment) -> None:
-        await self._quota.reserve(device.owner, segment.blob, segment.length, device=device.id)
-        try:
-            await self._quota.reserve(device.owner, segment.overview_blob, segment.overview_length, device=device.id)
-        except Problem:
-            await quota.release(self._tables, device.owner, segment.blob)
-            raise
+        sizes = {segment.blob: segment.length, segment.overview_blob: segment.overview_length}
+        await self._quota.reserve_all(device.owner, sizes, device=device.id)
 
     async def _write(self, device: Device, row: Row | None, segment: Segment) -> None:
         key = _segment_key(segment.epoch, segment.segment)
@@ -225,8 +236,15 @@ class Recordings:
         """Replace all episodes of a recording if they still have this version.
 
         Raises:
-            Problem: ``recording-unknown``, ``episodes-changed``, ``busy``.
+            Problem: ``episodes-invalid`` (too much text), ``recording-unknown``, ``episodes-changed``, ``busy``.
         """
+        size = len(msgspec.json.encode(list(episodes)))
+        if size > _MAX_EPISODES_BYTES:
+            detail = (
+                f"The episodes need {size} bytes; a recording stores {_MAX_EPISODES_BYTES}. Shorten labels and notes, "
+                "or send fewer episodes."
+            )
+            raise invalid(detail, code="episodes-invalid")
 
         def change(recording: RecordingRow) -> RecordingRow:
             if not recording.recorded or recording.deleted:
@@ -246,14 +264,33 @@ class Recordings:
         recording = await self._recording(device, epoch)
         if recording is None:
             raise not_found("recording", str(epoch))
-        # From here on it is deleted for all callers, even if this process is killed; a repetition continues.
+        # Before it is hidden: if this process is killed, retention deletes what the owner does not see any more.
+        due_ms = self._clock.now_ms() + _DELETION_MS
+        for segment in await self._segments(device, epoch):
+            await self._expire(device, segment, due_ms=due_ms)
+        # From here on it is deleted for all callers.
         await self._change(device, epoch, lambda each: replace(each, deleted=True, recorded=False, episodes=()))
         for segment in await self._segments(device, epoch):
-            for blob in (segment.blob, segment.overview_blob):
-                await self._blobs.delete(blob)
-                await quota.release(self._tables, segment.account, blob)
-            key = _segment_key(epoch, segment.segment)
-            await records.remove(self._tables, records.RECORDINGS, _partition(device), key)
+            await self._remove(device, segment)
+
+    async def _expire(self, device: Device, segment: Segment, *, due_ms: int) -> None:
+        """Let retention delete a segment and its files at ``due_ms`` [ms since 1970]."""
+        if segment.expires_ms <= due_ms:
+            return
+        await self._schedule_deletion(device, replace(segment, expires_ms=due_ms))
+        place = (records.RECORDINGS, _partition(device), _segment_key(segment.epoch, segment.segment))
+        # A row that expires later would be kept with its files.
+        await records.upsert(
+            self._tables, *place, lambda present: present and replace(present, expires_ms=due_ms), Segment
+        )
+
+    async def _remove(self, device: Device, segment: Segment) -> None:
+        """Delete a segment with its files now. Idempotent."""
+        for blob in (segment.blob, segment.overview_blob):
+            await self._blobs.delete(blob)
+            await quota.release(self._tables, segment.account, blob)
+        key = _segment_key(segment.epoch, segment.segment)
+        await records.remove(self._tables, records.RECORDINGS, _partition(device), key)
 
     async def forget(self, device: Device, *, due_ms: int) -> None:
         """Delete all recordings of an ended pairing at ``due_ms`` [ms since 1970]."""
@@ -267,9 +304,11 @@ class Recordings:
 
     # ------------------------------------------------------------ rows
 
-    async def _has_session(self, device: Device, epoch: int) -> bool:
+    async def _session(self, device: Device, epoch: int) -> Session:
         session = await self._session_log.get(device, epoch)
-        return session is not None and bool(session.started_ms)
+        if session is None or not session.started_ms:
+            raise not_found("session", str(epoch))
+        return session
 
     async def _recording(self, device: Device, epoch: int) -> RecordingRow | None:
         partition, key = _partition(device), _recording_key(epoch)

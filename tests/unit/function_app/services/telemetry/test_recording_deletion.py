@@ -1,5 +1,7 @@
 """Recordings are deleted by their owner, after their session, and if an upload is not completed."""
 
+from collections.abc import Mapping
+
 import pytest
 
 from function_app.domain.devices.devices import Agent
@@ -25,6 +27,10 @@ def test_owners_delete_a_recording_for_good(recorder: Recorder, bert: Person) ->
     shown = recorder.read()
     assert (shown["recorded"], shown["recording"]) == (False, None)
     problem(recorder.put_episodes(etag='"1"'), 404, "recording-unknown")
+
+
+class Killed(Exception):  # noqa: N818 (not an error: the end of the process)
+    """The process is killed."""
 
 
 def sweep(cloud: Cloud) -> None:
@@ -114,6 +120,61 @@ def test_an_upload_after_the_deletion_of_a_recording_leaves_nothing(
     problem(recorder.complete(1), 404, "segment-unknown")
     expire(cloud)
     assert (recorder.blobs(), recorder.used_bytes()) == ((), 0)
+
+
+def test_an_interrupted_deletion_is_completed(
+    recorder: Recorder, cloud: Cloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder.store(0)
+    recorder.store(1)
+    recorder.begin(2)
+    partition = partition_of(cloud, recorder.robot)
+    blobs = cloud.functions.blobs
+    delete = blobs.delete
+    deleted: list[str] = []
+
+    async def killed_after_the_first(name: str) -> None:
+        if deleted:
+            raise Killed
+        await delete(name)
+        deleted.append(name)
+
+    device = cloud.run(cloud.functions.devices.get_as_owner(recorder.robot.device))
+    assert device is not None
+    with monkeypatch.context() as patch:
+        patch.setattr(blobs, "delete", killed_after_the_first)
+        with pytest.raises(Killed):
+            cloud.run(cloud.functions.recordings.delete(device, recorder.epoch))
+    assert len(recorder.blobs()) == 3
+    assert recorder.read()["recorded"] is False
+    cloud.clock.advance(601)
+    sweep(cloud)
+    assert recorder.blobs() == ()
+    expire(cloud)  # the announced segment
+    assert (rows(cloud, partition), recorder.used_bytes()) == (1, 0), "only the mark of the deletion is left"
+
+
+def test_a_segment_that_is_announced_during_the_deletion_is_not_stored(
+    recorder: Recorder, cloud: Cloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder.store(0)
+    partition = partition_of(cloud, recorder.robot)
+    reserve = cloud.functions.quota.reserve_all
+
+    async def deleted_meanwhile(account: str, sizes: Mapping[str, int], *, device: str = "") -> None:
+        target = await cloud.functions.devices.get_as_owner(device)
+        assert target is not None
+        await cloud.functions.recordings.delete(target, recorder.epoch)
+        await reserve(account, sizes, device=device)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cloud.functions.quota, "reserve_all", deleted_meanwhile)
+        upload = recorder.begin(1).json()
+    assert recorder.send(upload["segment"], CONTENT) == 201
+    assert recorder.send(upload["overview"], OVERVIEW) == 201
+    problem(recorder.complete(1), 404, "segment-unknown")
+    assert (rows(cloud, partition), recorder.blobs(), recorder.used_bytes()) == (1, (), 0)
+    assert recorder.begin(1).json()["stored"] is True  # the agent does not repeat the upload
 
 
 def test_unpairing_deletes_recordings(recorder: Recorder, cloud: Cloud) -> None:

@@ -2,8 +2,11 @@
 
 from dataclasses import replace
 
+import msgspec
 import pytest
 
+from function_app.domain.telemetry.recordings import SPARE_SEGMENTS
+from function_app.ports.tables import MAX_DATA_BYTES
 from tests.harness.cloud.cloud import Cloud, Person, problem
 from tests.unit.function_app.services.sharing.shares import share
 from tests.unit.function_app.services.telemetry.recordings_fixture import CONTENT, OVERVIEW, Recorder, episode, sha256
@@ -144,6 +147,38 @@ def test_an_agent_that_does_not_name_its_segments_may_upload_more(recorder: Reco
     assert recorder.missing() == ([(0, "unknown")], False)
     recorder.store(0)
     assert recorder.missing() == ([], True)
+
+
+def test_numbers_that_a_session_cannot_have_reached_are_refused(recorder: Recorder, cloud: Cloud) -> None:
+    problem(recorder.begin(SPARE_SEGMENTS + 1), 422, "invalid")
+    cloud.clock.advance(100)
+    last = SPARE_SEGMENTS + 100
+    assert str(last) in problem(recorder.begin(999_999), 422, "invalid")["detail"]
+    recorder.store(0, pending=[last])
+    upload = recorder.begin(last).json()
+    recorder.send(upload["segment"], CONTENT)
+    recorder.send(upload["overview"], OVERVIEW)
+    problem(recorder.complete(last, [0, 999_999]), 422, "invalid")
+    assert recorder.complete(last, [1]).status_code == 204
+
+
+@pytest.mark.parametrize(("excess", "status"), [(0, 200), (1, 422)])
+def test_the_size_of_all_episodes_is_limited(recorder: Recorder, excess: int, status: int) -> None:
+    recorder.store()
+    episodes = [episode(each / 10, (each + 1) / 10, note="é" * 600) for each in range(200)]
+    left = MAX_DATA_BYTES - 1_024 + excess - len(msgspec.json.encode(episodes))
+    for each in episodes:
+        text = "x" * max(0, min(left, 800))
+        each["note"] += text
+        left -= len(text)
+    assert left == 0
+    answer = recorder.put_episodes(*episodes)
+    assert answer.status_code == status
+    if excess:
+        assert "Shorten labels and notes" in problem(answer, 422, "episodes-invalid")["detail"]
+    else:
+        assert recorder.read()["recording"]["episodes"] == episodes
+        recorder.store(1)  # the row is written again
 
 
 def test_operators_annotate_and_viewers_read_episodes(recorder: Recorder, bert: Person) -> None:
