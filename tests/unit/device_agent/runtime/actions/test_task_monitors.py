@@ -121,11 +121,13 @@ def test_a_sensor_of_the_room_decides_about_a_real_robot(make_device: MakeDevice
     press(False)
     request = trial(
         harness,
-        "while not robot.latest('b-button', 'state')['values']['pressed']: wait(0.01)",
+        "print('observed')\nwhile not robot.latest('b-button', 'state')['values']['pressed']: wait(0.01)",
         name="press_button",
         seed=None,
     )
     running = harness.running(request, epoch=1)
+    # The trial is rejected if the button is pressed before the monitor is open, and it is open before the script runs.
+    eventually(lambda: any("observed" in ack.output for ack in harness.acks(running)))
 
     def ended() -> list[Ack]:
         press(True)  # Old measurements do not count.
