@@ -9,13 +9,17 @@ import io
 import os
 import re
 import shutil
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from device_agent.runtime.recording.messages import RecordingLimits
 
 _SEGMENT = re.compile(r"\A(\d{4,})\.(?:mcap|live)\Z")
+_COMPLETE, _UPLOADED = ".mcap", ".uploaded"
+_CLOCK_STEP_NS = 1_000_000_000
+"""Two changes within this time may have the same time of change, because file systems use a coarse clock [ns]."""
 _OWNER = "owner"
 MODE, FOLDER_MODE = 0o600, 0o700
 
@@ -48,6 +52,8 @@ class RecordingFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._settled: dict[str, int] = {}
+        """Folder of a session → time of its last change when all its segments were uploaded [ns]."""
 
     def claim(self, owner: str) -> None:
         """Delete recordings of a former owner. ``owner``: space and account of the present one.
@@ -80,15 +86,30 @@ class RecordingFolder:
 
     def segments(self) -> list[StoredSegment]:
         """Complete segments, oldest first."""
-        found = []
-        for path in self.folder.glob("*/*/*.mcap"):
-            with contextlib.suppress(FileNotFoundError, ValueError):
-                status, overview = path.stat(), overview_of(path)
-                size = status.st_size + (overview.stat().st_size if overview.exists() else 0)
-                epoch, segment = int(path.parent.name), int(path.stem)
-                uploaded, device = uploaded_of(path).exists(), path.parent.parent.name
-                found.append(StoredSegment(path, device, epoch, segment, size, uploaded, status.st_mtime))
-        return sorted(found, key=lambda each: (each.at_s, each.device, each.epoch, each.segment))
+        return _stored(each for session in self._sessions() for each in _complete(session))
+
+    def waiting(self) -> list[StoredSegment]:
+        """Complete segments that are not uploaded, oldest first.
+
+        The agent calls this every few seconds, so a session whose segments are uploaded is read again only after its
+        folder has changed.
+        """
+        found, settled = [], {}
+        for session in self._sessions():
+            with contextlib.suppress(FileNotFoundError):
+                changed_ns = os.stat(session).st_mtime_ns  # noqa: PTH116 (without a Path for each session)
+                if self._settled.get(session) != changed_ns:
+                    complete = [each for each in _complete(session) if not each[1]]
+                    found += complete
+                    if complete or time.time_ns() - changed_ns < _CLOCK_STEP_NS:
+                        continue
+                settled[session] = changed_ns
+        self._settled = settled
+        return _stored(found)
+
+    def _sessions(self) -> Iterator[str]:
+        for device in _subfolders(self.folder):
+            yield from _subfolders(device)
 
     def pending(self, device: str, epoch: int) -> tuple[int, ...]:
         """Numbers of the segments of a session that are not uploaded, also those that are being written or sealed."""
@@ -145,7 +166,7 @@ def overview_of(segment: Path) -> Path:
 
 def uploaded_of(segment: Path) -> Path:
     """Path of the file that marks a segment as uploaded."""
-    return segment.with_suffix(".uploaded")
+    return segment.with_suffix(_UPLOADED)
 
 
 def delete(segment: Path) -> None:
@@ -168,6 +189,32 @@ def create(path: Path) -> int:
         OSError: It exists, or cannot be created.
     """
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, MODE)
+
+
+def _subfolders(folder: Path | str) -> list[str]:
+    with contextlib.suppress(FileNotFoundError), os.scandir(folder) as entries:
+        return [entry.path for entry in entries if entry.is_dir()]
+    return []
+
+
+def _complete(session: str) -> Iterator[tuple[str, bool]]:
+    """Path of each complete segment, and whether it is uploaded."""
+    with contextlib.suppress(FileNotFoundError):
+        names = set(os.listdir(session))  # noqa: PTH208 (without a Path for each file)
+        stems = [name.removesuffix(_COMPLETE) for name in names if name.endswith(_COMPLETE)]
+        yield from ((f"{session}/{stem}{_COMPLETE}", f"{stem}{_UPLOADED}" in names) for stem in stems)
+
+
+def _stored(complete: Iterable[tuple[str, bool]]) -> list[StoredSegment]:
+    found = []
+    for name, uploaded in complete:
+        path = Path(name)
+        with contextlib.suppress(FileNotFoundError, ValueError):
+            status, overview = path.stat(), overview_of(path)
+            size = status.st_size + (overview.stat().st_size if overview.exists() else 0)
+            device, epoch, segment = path.parent.parent.name, int(path.parent.name), int(path.stem)
+            found.append(StoredSegment(path, device, epoch, segment, size, uploaded, status.st_mtime))
+    return sorted(found, key=lambda each: (each.at_s, each.device, each.epoch, each.segment))
 
 
 def _size(path: Path) -> int:

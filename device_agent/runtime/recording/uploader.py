@@ -67,11 +67,11 @@ class RecordingUploader:
     def upload(self) -> None:
         """Upload what is due. Never raises: the supervisor would hold the devices."""
         try:
-            for each in self._folder.segments():
+            for each in self._folder.waiting():
                 if self._stopping.is_set() or self._is_behind():
                     return
                 due_s = self._failed.get(each.path, (float("-inf"), 0.0))[0]
-                if not each.uploaded and self._clock_s() >= due_s and not self._upload(each):
+                if self._clock_s() >= due_s and not self._upload(each):
                     return  # the next call continues with another segment
         except Exception:  # noqa: BLE001 (see above)
             _log.exception("upload of recordings")

@@ -51,6 +51,36 @@ def test_segments_are_listed_oldest_first(folder: RecordingFolder) -> None:
     assert {each.size for each in found} == {1000}
 
 
+def test_only_segments_that_are_not_uploaded_wait(folder: RecordingFolder) -> None:
+    newer = add(folder, 1, epoch=8, age_s=1)
+    older = add(folder, 0, epoch=7, age_s=2)
+    add(folder, 0, epoch=8, age_s=3, uploaded=True)
+    assert [each.path for each in folder.waiting()] == [older, newer]
+    uploaded_of(older).touch()
+    assert [each.path for each in folder.waiting()] == [newer]
+
+
+def test_an_uploaded_session_is_read_again_only_after_a_change(
+    folder: RecordingFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = add(folder, 0, uploaded=True)
+    read: list[str] = []
+    listdir = os.listdir
+    monkeypatch.setattr(files.os, "listdir", lambda each: (read.append(Path(each).name), listdir(each))[1])
+    assert folder.waiting() == []
+    assert folder.waiting() == []
+    assert len(read) == 2, "a change within the same step of the clock would not be seen"
+    os.utime(path.parent, (NOW_S, NOW_S))
+    for _ in range(3):
+        assert folder.waiting() == []
+    assert len(read) == 3
+    late = add(folder, 1)
+    assert [each.path for each in folder.waiting()] == [late]
+    files.delete(late)
+    files.delete(path)
+    assert folder.waiting() == []
+
+
 def test_old_segments_are_deleted_and_counted_if_not_uploaded(folder: RecordingFolder) -> None:
     add(folder, 0, age_s=101, uploaded=True)
     add(folder, 1, age_s=101)
