@@ -1,6 +1,8 @@
 """``run``: run the agent."""
 
 import argparse
+import contextlib
+import ctypes
 import gc
 import logging
 import os
@@ -41,6 +43,8 @@ _WATCHDOG_S, _STARTING_WATCHDOG_S = 10.0, 60.0
 _NOTIFY_S = 0.5
 _RETRY_S = 5.0
 _SWITCH_INTERVAL_S = 0.001
+_M_ARENA_MAX, _HEAPS = -8, 2
+"""Parameter of ``mallopt`` in ``malloc.h``, and its value."""
 _log = logging.getLogger(__name__)
 
 
@@ -57,6 +61,7 @@ def add_commands(commands: Commands, home: Path) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    _limit_heaps()
     store = IdentityStore(options.home)
     with store.lock():
         trial = Trial.of(store.folder, os.environ)
@@ -215,6 +220,17 @@ def _force_exit_later() -> None:
     timer = threading.Timer(_STOP_S, os._exit, (EXIT_FAILED,))
     timer.daemon = True
     timer.start()
+
+
+def _limit_heaps() -> None:
+    """Use two heaps for all threads.
+
+    The GNU C library makes up to eight for each processor, and free memory of one cannot be used by the threads of
+    another. The agent of five devices has seventy threads.
+    """
+    if sys.platform == "linux":
+        with contextlib.suppress(AttributeError):  # another C library
+            ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _HEAPS)
 
 
 def _prioritize_control_loops() -> None:

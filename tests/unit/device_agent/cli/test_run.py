@@ -1,6 +1,8 @@
 """Supervision by the program: the watchdog of systemd is notified only while essential threads run."""
 
 import os
+import subprocess
+import sys
 import threading
 from types import SimpleNamespace
 from typing import Any
@@ -67,3 +69,30 @@ def test_a_failure_ends_the_process_even_if_its_orderly_end_hangs(
     assert exited.wait(60)
     assert codes == [run.EXIT_FAILED]
     assert "the control loop has ended" in capsys.readouterr().err
+
+
+_ALLOCATE = """
+import ctypes, threading
+from device_agent.cli import run
+
+{limit}
+library = ctypes.CDLL(None)
+barrier = threading.Barrier(6)
+
+def allocate():
+    library.malloc(1000)
+    barrier.wait()
+
+threads = [threading.Thread(target=allocate) for _ in range(6)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+library.malloc_stats()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the GNU C library")
+@pytest.mark.parametrize(("limit", "few"), [("run._limit_heaps()", True), ("", False)])
+def test_threads_share_two_heaps(limit: str, few: bool) -> None:
+    program = [sys.executable, "-c", _ALLOCATE.format(limit=limit)]
+    shown = subprocess.run(program, capture_output=True, text=True, check=True).stderr
+    assert (shown.count("Arena ") <= 2) is few
