@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import contextlib
+import functools
 import os
 import secrets
 import time
@@ -32,6 +33,7 @@ _COMPACT = "~"
 _SUFFIX = ".blob"
 _TEMPORARY = ".part"
 _ABANDONED_S = 86_400
+_SWEEP_S = 3600.0
 _READ_BYTES = 1024 * 1024
 _ALGORITHM = "HS256"
 _UPLOAD = "telescope/blobs/upload"
@@ -58,6 +60,7 @@ class FileBlobs:
         random_keys = (secrets.token_bytes(32),)
         self._keys = keys or (lambda: random_keys)
         self._url = url
+        self._sweep_s = float("-inf")
 
     @property
     def origin(self) -> str:
@@ -160,7 +163,10 @@ class FileBlobs:
         path.parent.mkdir(parents=True, exist_ok=True)
 
     def _delete_abandoned(self) -> None:
-        """Delete temporary files of interrupted uploads."""
+        """Delete temporary files of interrupted uploads, at most once an hour: it reads the names of all blobs."""
+        if time.monotonic() < self._sweep_s:
+            return
+        self._sweep_s = time.monotonic() + _SWEEP_S
         for path in self._folder.glob(f"*{_TEMPORARY}"):
             with contextlib.suppress(OSError):
                 if time.time() - path.stat().st_mtime > _ABANDONED_S:
@@ -184,10 +190,7 @@ class FileBlobs:
         """See ``Blobs``."""
 
     def _path(self, name: str) -> Path:
-        check_name(name)
-        encoded = _encode(name)
-        parts = [encoded[start : start + _PART] for start in range(0, len(encoded), _PART)]
-        return self._folder.joinpath(*(f"{part}+" for part in parts[:-1]), parts[-1] + _SUFFIX)
+        return self._folder / _relative_path(name)
 
     def _put(self, path: Path, content: bytes) -> None:
         temporary = self._folder / f"{secrets.token_hex(8)}{_TEMPORARY}"
@@ -257,6 +260,15 @@ def _flush(file: BinaryIO) -> None:
 
 def _exists_already() -> TransferRefused:
     return TransferRefused(409, "The blob exists already and cannot be replaced.")
+
+
+@functools.lru_cache(maxsize=256)
+def _relative_path(name: str) -> Path:
+    """Where a blob is stored. Cached because an upload, its checks and its first reads use the same name."""
+    check_name(name)
+    encoded = _encode(name)
+    parts = [encoded[start : start + _PART] for start in range(0, len(encoded), _PART)]
+    return Path(*(f"{part}+" for part in parts[:-1]), parts[-1] + _SUFFIX)
 
 
 def _encode(name: str) -> str:

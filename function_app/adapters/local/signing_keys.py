@@ -38,6 +38,7 @@ class FileKeys(RingKeys):
     def __init__(self, folder: Path, *, now_ms: Callable[[], int] = wall_ms) -> None:
         super().__init__(now_ms=now_ms)
         self._folder = folder
+        self._ring_file = folder / RING
         self._seen: tuple[int, int, int] | None = None
         self._read: Ring
         self._changes_ms = 0
@@ -66,7 +67,7 @@ class FileKeys(RingKeys):
     def _cached(self) -> Ring:
         """The ring in the file. Removes retired keys from the file and from the broker's public keys."""
         with self._guarded():
-            if self._seen is None and not (self._folder / RING).exists():
+            if self._seen is None and not self._ring_file.exists():
                 self._create()
             if self._stamp() != self._seen or self._now_ms() >= self._changes_ms:
                 with self._locked():
@@ -80,25 +81,25 @@ class FileKeys(RingKeys):
             return self._read
 
     def _stamp(self) -> tuple[int, int, int]:
-        status = (self._folder / RING).stat()
+        status = self._ring_file.stat()
         return status.st_mtime_ns, status.st_size, status.st_ino
 
     def _parse(self) -> Ring:
-        return Ring.read((self._folder / RING).read_bytes())
+        return Ring.read(self._ring_file.read_bytes())
 
     def _create(self) -> None:
         """Create the ring. ``os.link`` fails if another process created it at the same time."""
         self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         former = self._folder / FORMER
         key = key_ring.from_pem(former.read_bytes()) if former.exists() else signing.generate()
-        temporary = atomic_files.write_temporary(self._folder / RING, Ring.first(key).text.encode(), mode=0o600)
+        temporary = atomic_files.write_temporary(self._ring_file, Ring.first(key).text.encode(), mode=0o600)
         with contextlib.suppress(FileExistsError):
-            os.link(temporary, self._folder / RING)
+            os.link(temporary, self._ring_file)
         temporary.unlink()
         former.unlink(missing_ok=True)
 
     def _write(self, ring: Ring) -> None:
-        atomic_files.write(self._folder / RING, ring.text.encode(), mode=0o600)
+        atomic_files.write(self._ring_file, ring.text.encode(), mode=0o600)
 
     def _publish(self, ring: Ring) -> None:
         """Write the valid public keys for the embedded broker."""
@@ -113,7 +114,7 @@ class FileKeys(RingKeys):
             return
         for path, forbidden in (
             (self._folder, _OTHERS),
-            (self._folder / RING, _OTHERS),
+            (self._ring_file, _OTHERS),
             (self._folder / PUBLIC, _OTHERS_WRITE),
         ):
             if path.exists() and (mode := stat.S_IMODE(path.stat().st_mode)) & forbidden:

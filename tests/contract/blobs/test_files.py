@@ -2,7 +2,9 @@
 
 import asyncio
 import base64
+import os
 import socket
+import time
 from collections.abc import AsyncIterator, Awaitable
 from pathlib import Path
 from typing import IO, Any
@@ -54,6 +56,23 @@ def _renamed(url: str, name: str, other: str) -> str:
 
 class TestFileBlobs(BlobsSuite):
     pass
+
+
+async def test_files_of_interrupted_uploads_are_deleted_after_a_day(blobs: Blobs, tmp_path: Path) -> None:
+    async def content() -> AsyncIterator[bytes]:
+        yield b"x"
+
+    async def upload(name: str) -> None:
+        upload = await blobs.presign_upload(name, length=1, content_type="text/plain", lifetime_s=60)
+        await blobs.receive(upload.url.rpartition("/")[2], {"content-type": "text/plain"}, content())
+
+    await blobs.put("first", b"x")
+    abandoned, recent = tmp_path / "blobs" / "a.part", tmp_path / "blobs" / "b.part"
+    for path, age_s in ((abandoned, 90_000), (recent, 3600)):
+        path.touch()
+        os.utime(path, (time.time() - age_s, time.time() - age_s))
+    await upload("second")
+    assert [path.name for path in tmp_path.rglob("*.part")] == [recent.name]
 
 
 async def test_no_name_leaves_the_folder_and_no_file_remains(blobs: Blobs, tmp_path: Path) -> None:
