@@ -83,6 +83,7 @@ def test_without_a_decision_no_camera_may_be_recorded(site: Site) -> None:
 def test_the_owners_decision_is_signed_numbered_and_recorded(site: Site) -> None:
     answer = site.decide("front", "front").json()
     assert (answer["cameras"], answer["by"], answer["reason"]) == (["front"], "anna", None)
+    assert site.anna.get(site.path).json() == {**answer, "confirmed": False}, "it has not reported its state since"
     site.decide()
     assert site.sent() == [(("front",), 1), ((), 2)]
     command = site.robot.received(SetCameraConsent)[0]
@@ -93,6 +94,7 @@ def test_the_owners_decision_is_signed_numbered_and_recorded(site: Site) -> None
         ("done", site.robot.device, []),
         ("done", site.robot.device, ["front"]),
     ]
+    assert {each["actor"] for each in entries} == {"anna"}
 
 
 def test_only_the_owner_may_decide(site: Site) -> None:
@@ -125,6 +127,12 @@ def test_a_camera_that_cannot_be_recorded_is_named(site: Site, camera: str) -> N
     )
     site.cloud.settle()
     assert problem(site.decide("front"), 422, "invalid")["detail"].endswith("it has: none.")
+
+
+def test_a_device_that_has_not_described_itself_has_no_cameras(cloud: Cloud) -> None:
+    with paired(cloud) as (anna, robot):
+        answer = anna.put(f"/devices/{robot.device}/camera-consent", {"cameras": ["front"], "wait_ms": 0})
+        assert problem(answer, 422, "invalid")["detail"].endswith("it has: none.")
 
 
 def test_an_agent_without_this_request_is_named(site: Site) -> None:
