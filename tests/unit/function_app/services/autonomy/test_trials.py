@@ -1,6 +1,7 @@
 """Trials of tasks: what is stored about them, and their success rates."""
 
 from dataclasses import replace
+from datetime import datetime
 from typing import Any
 
 import pytest
@@ -9,8 +10,10 @@ from device_agent.protocol import AckStatus, Reason, RunTrial
 from device_agent.protocol.manifests import tasks
 from device_agent.protocol.manifests.shipped import ROBOTS
 from function_app.domain.actions.action import LOST
-from function_app.domain.actions.trials import Trial
+from function_app.domain.actions.trials import Trial, TrialBatch
 from function_app.ports.tables import Row
+from function_app.services.actions import trial_log
+from function_app.services.actions.trial_log import KEEP_MS
 from function_app.services.autonomy import task_reports
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
@@ -259,6 +262,21 @@ def test_a_report_asks_for_no_more_rows_than_it_evaluates(
     assert [size for size in sizes if size != task_reports.MAX_BATCHES] == [1_000, 51]
 
 
+def test_more_trials_than_one_query_returns_are_read_once(
+    cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish(anna, robot, begin(anna, robot)["id"], SUCCESS)
+    plant_copies(cloud, robot, 6)
+    monkeypatch.setattr(trial_log, "_MAX_PAGE", 2)
+    device = cloud.run(cloud.functions.devices.get_as_owner(robot.device))
+    assert device is not None
+    log = cloud.functions.trial_log
+    found = cloud.run(log.read([device], limit=10))
+    keys = [trial_log.key_of(trial) for trial in found]
+    assert len(set(keys)) == len(keys) == 7
+    assert cloud.run(log.read([device], after=keys[2], limit=3)) == found[3:6]
+
+
 def test_older_trials_are_left_out_of_a_report_that_says_so(
     cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -289,7 +307,22 @@ def test_a_published_batch_is_shown_apart_from_trials_of_devices(anna: Person, b
     assert (batch["rate"]["rate"], batch["causes"], batch["published_by"]) == (0.9, {"time_limit": 1}, "anna")
     assert body["rate"]["trials"] == 0
     assert report(bert)["batches"] == []
-    assert anna.get(f"{TASKS}/blue_cube_in_green_tray").json()["batches"] == []
+    for other in ("blue_cube_in_green_tray", "yellow_block_in_green_tray"):
+        assert anna.get(f"{TASKS}/{other}").json()["batches"] == []
+
+
+def test_a_batch_is_stored_for_two_years(cloud: Cloud, anna: Person) -> None:
+    anna.post(f"{TASKS}/{TASK}/batches", BATCH)
+    published_ms = cloud.clock.now_ms()
+    (batch,) = report(anna)["batches"]
+    assert datetime.fromisoformat(batch["published_at"]).timestamp() * 1000 == pytest.approx(published_ms, abs=1000)
+    partition = f"batches/{anna.account}/ur5_gripper"
+    (row,) = cloud.run(cloud.functions.tables.query(records.TRIALS, partition)).rows
+    assert records.read(row, TrialBatch).expires_ms == pytest.approx(published_ms + KEEP_MS, abs=1000)
+    pass_time(cloud, 729 * DAY_S, step_s=729 * DAY_S)
+    assert cloud.run(cloud.functions.tables.query(records.TRIALS, partition)).rows == (row,)
+    pass_time(cloud, 2 * DAY_S, step_s=DAY_S)
+    assert cloud.run(cloud.functions.tables.query(records.TRIALS, partition)).rows == ()
 
 
 def test_a_batch_whose_numbers_contradict_each_other_is_rejected(anna: Person) -> None:
