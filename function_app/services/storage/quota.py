@@ -1,23 +1,25 @@
 """Limits for stored bytes: of an account, of a device, and of the disk.
 
-Each stored blob has a row in the partition of its account, so that the sum is exact after any interruption. A row is
-written before the sum is compared with the limit: concurrent requests may both be rejected, but never exceed it.
+Each stored blob has a row in the partition of its account. One more row has the sums. Both change in one batch, so the
+sums are exact after any interruption and below the limits with any number of concurrent requests.
 """
 
 import logging
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Final
 
 from function_app.domain.common.problems import Problem
 from function_app.ports.clock import Clock
-from function_app.ports.tables import Tables
+from function_app.ports.tables import Row, Tables, Write
 from function_app.services.storage import records
 
 DAY_MS = 86_400_000
 MB = 1_000_000
-_PAGE = 1_000
+_TOTALS: Final = ":totals"
+_AFTER_TOTALS: Final = ";"
+"""Key of the sums, and the first key behind it. All names of blobs begin with a letter."""
 _ACCOUNT_PREFIXES = ("movements", "robot-types", "recordings")
 """Blob names that continue with the account."""
 
@@ -41,12 +43,25 @@ class StorageLimits:
     min_free_bytes: int
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Usage:
     """Stored bytes of an account, and of its devices with captures or recordings."""
 
     total_bytes: int = 0
-    device_bytes: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    device_bytes: dict[str, int] = field(default_factory=dict)
+
+    def plus(self, size: int, device: str) -> "Usage":
+        """The usage with ``size`` more bytes [bytes], or fewer if it is negative."""
+        devices = dict(self.device_bytes)
+        if device:
+            devices[device] = devices.get(device, 0) + size
+        return Usage(max(0, self.total_bytes + size), {name: used for name, used in devices.items() if used > 0})
+
+
+@dataclass(frozen=True, slots=True)
+class _Blob:
+    bytes: int
+    device: str = ""
 
 
 class StorageQuota:
@@ -84,43 +99,34 @@ class StorageQuota:
         Raises:
             Problem: ``storage-full``, ``quota-exceeded``.
         """
-        size = sum(sizes.values())
-        if self._disk_is_full(size):
+        if self._disk_is_full(sum(sizes.values())):
             detail = "The server's disk is almost full. Robots can be operated, but no data is stored. Free disk space."
             raise Problem("storage-full", 507, "The disk is full", detail)
-        for blob, length in sizes.items():
-            await self._count(account, blob, {"bytes": length, "device": device})
-        usage = await self.usage(account)
-        for used_bytes, limit_bytes, owner in (
-            (usage.total_bytes, self.limits.account_bytes, "this account"),
-            (usage.device_bytes[device] if device else 0, self.limits.device_bytes, "this device"),
-        ):
-            if used_bytes > limit_bytes:
-                for blob in sizes:
-                    await release(self._tables, account, blob)
-                detail = (
-                    f"{size / MB:.1f} MB do not fit: {(used_bytes - size) / MB:.1f} MB of the {limit_bytes / MB:.0f} "
-                    f"MB for {owner} are in use. Delete captures, recordings, movements or robot types that are not "
-                    "needed."
-                )
-                extras = {"used_bytes": used_bytes - size, "limit_bytes": limit_bytes}
-                raise Problem("quota-exceeded", 413, "No storage left", detail, extras=extras)
+        blobs = {name: _Blob(size, device) for name, size in sizes.items()}
+        await _store(self._tables, account, blobs, lambda before, after: self._admit(before, after, device))
 
     async def usage(self, account: str) -> Usage:
         """The stored bytes of an account."""
-        result, cursor = Usage(), None
-        while True:
-            page = await self._tables.query(records.USAGE, account, limit=_PAGE, cursor=cursor)
-            for row in page.rows:
-                result.total_bytes += row.data["bytes"]
-                if row.data["device"]:
-                    result.device_bytes[row.data["device"]] += row.data["bytes"]
-            cursor = page.cursor
-            if cursor is None:
-                return result
+        return (await _find(self._tables, account))[1]
 
-    async def _count(self, account: str, blob: str, data: dict[str, Any]) -> None:
-        await records.upsert(self._tables, records.USAGE, account, blob, lambda _: data, dict)
+    def _admit(self, before: Usage, after: Usage, device: str) -> None:
+        for used_bytes, wanted_bytes, limit_bytes, owner in (
+            (before.total_bytes, after.total_bytes, self.limits.account_bytes, "this account"),
+            (
+                before.device_bytes.get(device, 0),
+                after.device_bytes.get(device, 0),
+                self.limits.device_bytes,
+                "this device",
+            ),
+        ):
+            if wanted_bytes > limit_bytes:
+                detail = (
+                    f"{(wanted_bytes - used_bytes) / MB:.1f} MB do not fit: {used_bytes / MB:.1f} MB of the "
+                    f"{limit_bytes / MB:.0f} MB for {owner} are in use. Delete captures, recordings, movements or "
+                    "robot types that are not needed."
+                )
+                extras = {"used_bytes": used_bytes, "limit_bytes": limit_bytes}
+                raise Problem("quota-exceeded", 413, "No storage left", detail, extras=extras)
 
     def refuse_measurement(self, device: str, size: int) -> str:
         """Count a measurement; returns the reason if it cannot be stored, otherwise an empty string."""
@@ -152,7 +158,7 @@ class StorageQuota:
 
 async def release(tables: Tables, account: str, blob: str) -> None:
     """Stop counting a deleted blob. Idempotent."""
-    await records.remove(tables, records.USAGE, account, blob)
+    await _store(tables, account, {blob: None})
 
 
 async def release_owned(tables: Tables, blob: str) -> None:
@@ -160,3 +166,43 @@ async def release_owned(tables: Tables, blob: str) -> None:
     match blob.split("/", 2):
         case [prefix, account, _] if prefix in _ACCOUNT_PREFIXES:
             await release(tables, account, blob)
+
+
+async def _store(
+    tables: Tables,
+    account: str,
+    blobs: Mapping[str, _Blob | None],
+    admit: Callable[[Usage, Usage], None] = lambda _before, _after: None,
+) -> None:
+    """Store what is known of some blobs (``None``: they are deleted), and the new sums, which ``admit`` may reject."""
+
+    async def attempt() -> None:
+        row, before = await _find(tables, account)
+        after, writes = before, []
+        for name, blob in blobs.items():
+            existing, former = await records.find(tables, records.USAGE, account, name, _Blob)
+            if former is not None:
+                after = after.plus(-former.bytes, former.device)
+            if blob is not None:
+                after = after.plus(blob.bytes, blob.device)
+                writes.append(records.write(existing, account, name, records.to_data(blob)))
+            elif existing is not None:
+                writes.append(Write("delete", existing))
+        if not writes:
+            return
+        if after.total_bytes > before.total_bytes:
+            admit(before, after)
+        writes.append(records.write(row, account, _TOTALS, records.to_data(after)))
+        await tables.batch(records.USAGE, writes)
+
+    await records.retry(attempt)
+
+
+async def _find(tables: Tables, account: str) -> tuple[Row | None, Usage]:
+    """The sums of an account, and their row. Former versions stored no sums, so they are counted once."""
+    row, usage = await records.find(tables, records.USAGE, account, _TOTALS, Usage)
+    if usage is None:
+        usage = Usage()
+        async for blob in records.all_rows(tables, records.USAGE, account, first=_AFTER_TOTALS):
+            usage = usage.plus(blob.data["bytes"], blob.data["device"])
+    return row, usage

@@ -11,6 +11,9 @@ import pytest
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.domain.common.problems import Problem
 from function_app.ports.blobs import TransferRefused
+from function_app.ports.tables import Row
+from function_app.services.storage import records
+from function_app.services.storage.quota import Usage, release
 from function_app.services.telemetry.uploads import SHARDS, UNREGISTERED_MS
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person, problem
@@ -76,8 +79,47 @@ def test_concurrent_reservations_never_exceed_the_limit(alone: Cloud) -> None:
         assert all(result is None or isinstance(result, Problem) for result in results)
         return (await alone.functions.quota.usage("anna")).total_bytes
 
-    assert alone.run(reserve_many()) <= 5 * KB
+    assert alone.run(reserve_many()) == 5 * KB
+    rows = alone.run(alone.functions.tables.query(records.USAGE, "anna")).rows
+    assert sum(row.data.get("bytes", 0) for row in rows) == 5 * KB
     assert alone.run(alone.functions.quota.usage("other")).total_bytes == 0
+
+
+def test_the_sums_of_a_former_version_are_counted_once(alone: Cloud) -> None:
+    tables, quota = alone.functions.tables, alone.functions.quota
+    limit(alone, account_bytes=4 * KB, device_bytes=3 * KB)
+    for name, device in (("captures/a", "arm"), ("captures/b", "arm"), ("movements/c", "")):
+        alone.run(tables.create(records.USAGE, Row("anna", name, {"bytes": KB, "device": device})))
+    assert alone.run(quota.usage("anna")) == Usage(3 * KB, {"arm": 2 * KB})
+    alone.run(quota.reserve("anna", "captures/d", KB, device="arm"))
+    for device in ("arm", "base"):
+        with pytest.raises(Problem) as refused:
+            alone.run(quota.reserve("anna", "captures/e", KB, device=device))
+        assert refused.value.code == "quota-exceeded"
+    alone.run(release(tables, "anna", "captures/a"))
+    assert alone.run(quota.usage("anna")) == Usage(3 * KB, {"arm": 2 * KB})
+
+
+def test_a_repeated_reservation_and_release_count_once(alone: Cloud) -> None:
+    tables, quota = alone.functions.tables, alone.functions.quota
+    limit(alone, account_bytes=5 * KB)
+    for size in (2 * KB, 2 * KB, 3 * KB):
+        alone.run(quota.reserve("anna", "captures/a", size, device="arm"))
+        assert alone.run(quota.usage("anna")) == Usage(size, {"arm": size})
+    with pytest.raises(Problem):
+        alone.run(quota.reserve_all("anna", {"captures/a": KB, "captures/b": 5 * KB}, device="arm"))
+    assert alone.run(quota.usage("anna")) == Usage(3 * KB, {"arm": 3 * KB}), "rejected together"
+    for _ in range(2):
+        alone.run(release(tables, "anna", "captures/a"))
+        assert alone.run(quota.usage("anna")) == Usage()
+
+
+def test_a_reservation_reads_no_other_blobs(alone: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    tables, quota = alone.functions.tables, alone.functions.quota
+    alone.run(quota.reserve("anna", "captures/a", KB))
+    monkeypatch.setattr(tables, "query", None)
+    alone.run(quota.reserve("anna", "captures/b", KB))
+    assert alone.run(quota.usage("anna")).total_bytes == 2 * KB
 
 
 def test_scripts_count_until_their_blob_is_deleted(cloud: Cloud, anna: Person) -> None:
