@@ -5,10 +5,16 @@ import os
 from collections.abc import Callable, Iterator
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.harness.stores.emulators import StoreKind, start_emulator
 
 pytest_plugins = ["tests.fixtures.brokers", "tests.fixtures.cloud", "tests.fixtures.sampling"]
+
+
+# Tests do not depend on the speed of the machine.
+settings.register_profile("tests", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("tests")
 
 
 @pytest.fixture(autouse=True)

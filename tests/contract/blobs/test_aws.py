@@ -148,7 +148,7 @@ SPECIAL = st.lists(st.sampled_from(["/", ".", "..", "!", "a", " ", "\x00", "0", 
 
 
 @given(one=TEXT | SPECIAL, other=TEXT | SPECIAL)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_keys_are_reversible_and_preserve_order_and_prefixes(one: str, other: str) -> None:
     keys = encode(one), encode(other)
     assert (decode(keys[0]), decode(keys[1])) == (one, other)

@@ -18,7 +18,7 @@ def key_of(name: str) -> str:
     return names.truncate(names.encode(name), names.MAX_KEY)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(one=TEXTS, other=TEXTS)
 def test_a_code_is_reversible_and_sorts_as_its_name(one: str, other: str) -> None:
     codes = names.encode(one), names.encode(other)
@@ -43,7 +43,7 @@ def test_names_of_telescope_stay_readable() -> None:
     assert names.encode("robots/ur5.xml") == "robots.0ur5.-xml"
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(text=st.text(alphabet=st.sampled_from("a/ü🤖" + EDGES), min_size=1, max_size=512))
 def test_a_key_respects_the_limit_and_is_truncated_only_if_necessary(text: str) -> None:
     code = names.encode(text)
@@ -54,7 +54,7 @@ def test_a_key_respects_the_limit_and_is_truncated_only_if_necessary(text: str) 
         assert key.startswith(names.head(code, limit))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     texts=st.lists(
         st.builds(str.__add__, st.sampled_from(LONG_STARTS), st.text(max_size=3)) | st.text(min_size=1, max_size=5),

@@ -97,7 +97,7 @@ def test_the_vectors_of_the_rfc_are_reproduced(vector: tuple[str, ...]) -> None:
     assert not legacy.verify(public, message + b"x", signature)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seeds, st.binary(max_size=200))
 def test_signatures_equal_those_of_the_library(seed: bytes, message: bytes) -> None:
     library = Ed25519PrivateKey.from_private_bytes(seed)
@@ -106,7 +106,7 @@ def test_signatures_equal_those_of_the_library(seed: bytes, message: bytes) -> N
     assert legacy.sign(seed, public, message) == library.sign(message)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 8 * 96 - 1))
 def test_a_signature_or_key_with_one_changed_bit_is_rejected(bit: int) -> None:
     changed = bytearray(PUBLIC + SIGNATURE)

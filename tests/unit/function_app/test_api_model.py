@@ -180,7 +180,7 @@ def explore(*, examples: int, steps: int, seeded: bool) -> None:
     run_state_machine_as_test(
         Machine,
         settings=settings(
-            max_examples=examples, stateful_step_count=steps, deadline=None, derandomize=seeded, database=None,
+            max_examples=examples, stateful_step_count=steps, derandomize=seeded, database=None,
             phases=[Phase.generate], suppress_health_check=list(HealthCheck),
         ),
     )  # fmt: skip

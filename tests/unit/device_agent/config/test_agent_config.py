@@ -44,7 +44,7 @@ VALUES: Any = st.recursive(
 )
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(name=LABELS, transport=st.sampled_from(["mqtt", "http"]), options=st.dictionaries(LABELS, VALUES, max_size=3))
 def test_saved_configuration_is_loaded(
     name: str, transport: str, options: dict[str, Any], tmp_path_factory: pytest.TempPathFactory

@@ -111,7 +111,7 @@ def test_a_jog_near_a_singularity_is_slow() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(twists=st.lists(st.tuples(*[st.floats(-2, 2)] * 6, st.booleans()), min_size=1, max_size=4))
 def test_random_jogs_stay_within_every_limit(twists: list[tuple[float, ...]]) -> None:
     fixture = Jogger()
@@ -203,7 +203,7 @@ _INVALID_NUMBERS: st.SearchStrategy[object] = st.one_of(
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.dictionaries(st.sampled_from([*DriveTarget.__struct_fields__, "up_m_s", ""]), _INVALID_NUMBERS),
     st.integers(0, 220),

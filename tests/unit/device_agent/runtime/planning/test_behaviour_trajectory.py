@@ -80,7 +80,7 @@ def test_lines_start_with_the_motion_to_their_keyframe() -> None:
     assert at(resting, 0.0) == at(resting, 9.0) == [0.3, 0.0, 0.0, 0.0]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     steps=st.lists(
         st.tuples(

@@ -107,7 +107,7 @@ def run(neck: Neck, events: Events) -> None:
 
 @pytest.mark.slow
 @BOTH_TABLES
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(events=events)
 def test_no_command_leaves_the_dependent_range(table: Table, events: Events) -> None:
     run(Neck(table), events)
@@ -115,7 +115,7 @@ def test_no_command_leaves_the_dependent_range(table: Table, events: Events) -> 
 
 @pytest.mark.long
 @BOTH_TABLES
-@settings(max_examples=3000, deadline=None)
+@settings(max_examples=3000)
 @given(events=events)
 def test_no_command_leaves_the_dependent_range_in_thousands_of_runs(table: Table, events: Events) -> None:
     run(Neck(table), events)

@@ -120,7 +120,7 @@ def movements(draw: st.DrawFn) -> list[PlayKeyframe]:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(movements())
 def test_random_movements_stay_within_limits_and_do_not_overshoot(keyframes: list[PlayKeyframe]) -> None:
     kind = head()

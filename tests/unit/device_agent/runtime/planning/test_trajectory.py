@@ -61,7 +61,7 @@ def derivatives(positions: Floats) -> list[float]:
 positions = st.lists(st.floats(-2.9, 2.9), min_size=2, max_size=2)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(corners=st.lists(positions, min_size=2, max_size=5), speed=st.floats(0.05, 1.0))
 def test_random_corners_stay_within_every_limit(corners: list[list[float]], speed: float) -> None:
     path = along(corners, speed=speed)

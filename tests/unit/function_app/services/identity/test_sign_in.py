@@ -170,7 +170,7 @@ class TestAccessToken:
             assert answer.headers["www-authenticate"] == "Bearer"
 
     def test_any_text_is_refused(self, cloud: Cloud) -> None:
-        @quickly(max_examples=80, deadline=None)
+        @quickly(max_examples=80)
         @given(st.text(alphabet=st.characters(min_codepoint=33, max_codepoint=255), max_size=60))
         def check(text: str) -> None:
             for path in ("/accounts/me", "/agents/enrollment"):

@@ -166,7 +166,7 @@ MESSAGES: list[dict[str, Any]] = [
 """One message of each class; the test replaces some fields with random values."""
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_every_message_is_stored_or_refused(
     cloud: Cloud, anna: Person, robot: PollingRobot, data: st.DataObject
