@@ -138,13 +138,17 @@ class RecordingFolder:
             OSError: A file cannot be deleted.
         """
         lost, kept = 0, []
+        used, oldest_s = self._used()
+        due = used > limits.max_bytes or now_s - oldest_s > limits.max_age_s
+        if not due and self.free_bytes() >= limits.min_free_bytes:
+            return 0
         for each in self.segments():
             if now_s - each.at_s > limits.max_age_s:
                 delete(each.path)
                 lost += not each.uploaded
             else:
                 kept.append(each)
-        used = sum(each.size for each in kept) + sum(map(_size, self.live()))
+        used, _ = self._used()
         for each in sorted(kept, key=lambda each: not each.uploaded):
             full = each.uploaded and self.free_bytes() < limits.min_free_bytes
             if used <= limits.max_bytes and not full:
@@ -156,7 +160,22 @@ class RecordingFolder:
 
     def used_bytes(self) -> int:
         """Size of all recordings [bytes]."""
-        return sum(each.size for each in self.segments()) + sum(map(_size, self.live()))
+        return self._used()[0]
+
+    def _used(self) -> tuple[int, float]:
+        """Size of all recordings [bytes], and when the oldest segment was completed [s since 1970].
+
+        Called for each new segment. A list of all segments would take memory and time in proportion to their number.
+        """
+        used, oldest_s = 0, float("inf")
+        for session in self._sessions():
+            for name in _names(session):
+                with contextlib.suppress(FileNotFoundError):  # deleted, or completed, meanwhile
+                    status = os.stat(f"{session}/{name}")  # noqa: PTH116 (without a Path for each file)
+                    used += status.st_size
+                    if name.endswith(_COMPLETE):
+                        oldest_s = min(oldest_s, status.st_mtime)
+        return used, oldest_s
 
 
 def overview_of(segment: Path) -> Path:
@@ -197,12 +216,18 @@ def _subfolders(folder: Path | str) -> list[str]:
     return []
 
 
+def _names(session: str) -> set[str]:
+    with contextlib.suppress(FileNotFoundError):
+        return set(os.listdir(session))  # noqa: PTH208 (without a Path for each file)
+    return set()
+
+
 def _complete(session: str) -> Iterator[tuple[str, bool]]:
     """Path of each complete segment, and whether it is uploaded."""
-    with contextlib.suppress(FileNotFoundError):
-        names = set(os.listdir(session))  # noqa: PTH208 (without a Path for each file)
-        stems = [name.removesuffix(_COMPLETE) for name in names if name.endswith(_COMPLETE)]
-        yield from ((f"{session}/{stem}{_COMPLETE}", f"{stem}{_UPLOADED}" in names) for stem in stems)
+    names = _names(session)
+    for name in names:
+        if name.endswith(_COMPLETE):
+            yield f"{session}/{name}", name.removesuffix(_COMPLETE) + _UPLOADED in names
 
 
 def _stored(complete: Iterable[tuple[str, bool]]) -> list[StoredSegment]:
@@ -215,13 +240,6 @@ def _stored(complete: Iterable[tuple[str, bool]]) -> list[StoredSegment]:
             device, epoch, segment = path.parent.parent.name, int(path.parent.name), int(path.stem)
             found.append(StoredSegment(path, device, epoch, segment, size, uploaded, status.st_mtime))
     return sorted(found, key=lambda each: (each.at_s, each.device, each.epoch, each.segment))
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except FileNotFoundError:  # it has been completed
-        return 0
 
 
 def write_file(path: Path, write: Callable[[io.BufferedWriter], object]) -> None:

@@ -98,6 +98,7 @@ def test_beyond_the_size_uploaded_segments_are_deleted_first_then_the_oldest(fol
 
 
 def test_segments_that_are_being_written_count(folder: RecordingFolder) -> None:
+    assert (folder.used_bytes(), folder.waiting()) == (0, []), "before the first recording"
     add(folder, 0)
     folder.live_path("arm", 7, 0).write_bytes(bytes(500))
     assert folder.used_bytes() == 1500
@@ -120,8 +121,22 @@ def test_deleting_the_last_segment_removes_the_folders(folder: RecordingFolder) 
     assert list(folder.folder.iterdir()) == []
 
 
-def test_a_segment_that_disappears_has_no_size(folder: RecordingFolder) -> None:
-    assert files._size(folder.folder / "missing") == 0
+def test_a_file_or_session_that_disappears_has_no_size(
+    folder: RecordingFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = add(folder, 0)
+    (path.parent / "0001.live").symlink_to("missing")
+    assert folder.used_bytes() == 1000
+    monkeypatch.setattr(folder, "_sessions", lambda: [str(path.parent), str(path.parent / "missing")])
+    assert folder.used_bytes() == 1000
+
+
+def test_without_anything_to_delete_no_list_of_segments_is_made(
+    folder: RecordingFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add(folder, 0, age_s=50)
+    monkeypatch.setattr(folder, "segments", None)
+    assert folder.enforce(limits(folder.folder, max_age_s=100, max_bytes=1000), now_s=NOW_S) == 0
 
 
 def test_recordings_of_a_former_owner_are_deleted(folder: RecordingFolder) -> None:
