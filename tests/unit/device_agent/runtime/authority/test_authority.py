@@ -243,3 +243,23 @@ def test_only_a_restriction_to_zero_prevents_motion() -> None:
     with pytest.raises(Refused, match="a person is there") as refused:
         fixture.authority.check_free()
     assert refused.value.code == "interlock"
+
+
+def test_a_device_that_stops_itself_ends_lease_and_action_as_a_fault() -> None:
+    fixture = Fixture()
+    fixture.acting()
+    authority = fixture.authority
+    authority.follow_device_stop(LATCH)
+    assert [(why.code, why.message) for why in fixture.revocations] == [("fault", LATCH.reason)]
+    assert fixture.event(EventKind.LEASE_ENDED).data == {"epoch": 3, "holder": "ann", "code": "fault"}
+    assert (authority.latch, authority.fault, authority.device_stopped) == (LATCH, LATCH.reason, True)
+
+
+def test_another_reason_of_the_same_stop_of_the_device_ends_nothing() -> None:
+    fixture = Fixture(latch=LATCH)
+    authority = fixture.authority
+    authority.follow_device_stop(StopLatch(caller="the device", reason="hit", at_ms=6))
+    fixture.holds.clear()
+    authority.follow_device_stop(StopLatch(caller="the device", reason="clearing", at_ms=7))
+    assert (fixture.holds, fixture.revocations) == ([], [])
+    assert (authority.latch, authority.fault) == (LATCH, "clearing")
