@@ -58,7 +58,9 @@ class TestFileBlobs(BlobsSuite):
     pass
 
 
-async def test_files_of_interrupted_uploads_are_deleted_after_a_day(blobs: Blobs, tmp_path: Path) -> None:
+async def test_files_of_interrupted_uploads_are_deleted_after_a_day(tmp_path: Path) -> None:
+    blobs = FileBlobs(tmp_path / "blobs")
+
     async def content() -> AsyncIterator[bytes]:
         yield b"x"
 

@@ -66,7 +66,12 @@ def test_an_uploaded_session_is_read_again_only_after_a_change(
     path = add(folder, 0, uploaded=True)
     read: list[str] = []
     listdir = os.listdir
-    monkeypatch.setattr(files.os, "listdir", lambda each: (read.append(Path(each).name), listdir(each))[1])
+
+    def counted(path: str) -> list[str]:
+        read.append(path)
+        return listdir(path)
+
+    monkeypatch.setattr(os, "listdir", counted)
     assert folder.waiting() == []
     assert folder.waiting() == []
     assert len(read) == 2, "a change within the same step of the clock would not be seen"
