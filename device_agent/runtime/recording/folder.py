@@ -165,7 +165,7 @@ class RecordingFolder:
     def _used(self) -> tuple[int, float]:
         """Size of all recordings [bytes], and when the oldest segment was completed [s since 1970].
 
-        Called for each new segment. A list of all segments would take memory and time in proportion to their number.
+        Called for each new segment, so it makes no list of all segments.
         """
         used, oldest_s = 0, float("inf")
         for session in self._sessions():

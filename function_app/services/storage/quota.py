@@ -4,11 +4,13 @@ Each stored blob has a row in the partition of its account. One more row has the
 sums are exact after any interruption and below the limits with any number of concurrent requests.
 """
 
+import asyncio
 import logging
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
+from weakref import WeakKeyDictionary, WeakValueDictionary
 
 from function_app.domain.common.problems import Problem
 from function_app.ports.clock import Clock
@@ -23,6 +25,8 @@ _AFTER_TOTALS: Final = ";"
 _ACCOUNT_PREFIXES = ("movements", "robot-types", "recordings")
 """Blob names that continue with the account."""
 
+_locks: WeakKeyDictionary[Tables, WeakValueDictionary[str, asyncio.Lock]] = WeakKeyDictionary()
+"""Store → account → lock: the writes of one process do not conflict with each other."""
 _log = logging.getLogger(__name__)
 
 
@@ -45,13 +49,13 @@ class StorageLimits:
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Stored bytes of an account, and of its devices with captures or recordings."""
+    """Stored bytes of an account, and of its devices with captures or recordings [bytes]."""
 
     total_bytes: int = 0
     device_bytes: dict[str, int] = field(default_factory=dict)
 
     def plus(self, size: int, device: str) -> "Usage":
-        """The usage with ``size`` more bytes [bytes], or fewer if it is negative."""
+        """The usage with ``size`` more bytes [bytes], which may be negative, of a ``device`` (empty: of none)."""
         devices = dict(self.device_bytes)
         if device:
             devices[device] = devices.get(device, 0) + size
@@ -60,6 +64,8 @@ class Usage:
 
 @dataclass(frozen=True, slots=True)
 class _Blob:
+    """The row of a blob: its size [bytes], and its device (empty: none)."""
+
     bytes: int
     device: str = ""
 
@@ -86,10 +92,10 @@ class StorageQuota:
         self._reported: set[str] = set()
 
     async def reserve(self, account: str, blob: str, size: int, *, device: str = "") -> None:
-        """Count a blob before it is written. Idempotent.
+        """Count a blob of ``size`` [bytes] before it is written. Idempotent.
 
         Raises:
-            Problem: ``storage-full``, ``quota-exceeded``.
+            Problem: ``storage-full``, ``quota-exceeded``, ``busy``.
         """
         await self.reserve_all(account, {blob: size}, device=device)
 
@@ -97,7 +103,7 @@ class StorageQuota:
         """Like ``reserve``, for blobs that are admitted or rejected together, with their sizes [bytes].
 
         Raises:
-            Problem: ``storage-full``, ``quota-exceeded``.
+            Problem: ``storage-full``, ``quota-exceeded``, ``busy``.
         """
         if self._disk_is_full(sum(sizes.values())):
             detail = "The server's disk is almost full. Robots can be operated, but no data is stored. Free disk space."
@@ -157,12 +163,16 @@ class StorageQuota:
 
 
 async def release(tables: Tables, account: str, blob: str) -> None:
-    """Stop counting a deleted blob. Idempotent."""
+    """Stop counting a deleted blob. Idempotent.
+
+    Raises:
+        Problem: ``busy``: other requests changed the sums in the meantime.
+    """
     await _store(tables, account, {blob: None})
 
 
 async def release_owned(tables: Tables, blob: str) -> None:
-    """Like ``release``, for a blob whose name contains its account."""
+    """Like ``release``, for a blob whose name contains its account. Raises ``busy``."""
     match blob.split("/", 2):
         case [prefix, account, _] if prefix in _ACCOUNT_PREFIXES:
             await release(tables, account, blob)
@@ -174,13 +184,18 @@ async def _store(
     blobs: Mapping[str, _Blob | None],
     admit: Callable[[Usage, Usage], None] = lambda _before, _after: None,
 ) -> None:
-    """Store what is known of some blobs (``None``: they are deleted), and the new sums, which ``admit`` may reject."""
+    """Store the rows of blobs (``None``: the blob is deleted) with the new sums.
+
+    ``admit`` gets the former and the new sums, and may raise a ``Problem``. Also raises ``busy``.
+    """
 
     async def attempt() -> None:
         row, before = await _find(tables, account)
         after, writes = before, []
         for name, blob in blobs.items():
             existing, former = await records.find(tables, records.USAGE, account, name, _Blob)
+            if former == blob:
+                continue
             if former is not None:
                 after = after.plus(-former.bytes, former.device)
             if blob is not None:
@@ -195,7 +210,9 @@ async def _store(
         writes.append(records.write(row, account, _TOTALS, records.to_data(after)))
         await tables.batch(records.USAGE, writes)
 
-    await records.retry(attempt)
+    locks = _locks.setdefault(tables, WeakValueDictionary())
+    async with locks.setdefault(account, asyncio.Lock()):
+        await records.retry(attempt)
 
 
 async def _find(tables: Tables, account: str) -> tuple[Row | None, Usage]:

@@ -11,6 +11,7 @@ import logging
 from collections.abc import Sequence
 from typing import Any, Final
 
+from function_app.domain.common.problems import Problem
 from function_app.ports.blobs import Blobs
 from function_app.ports.tables import MAX_BATCH, Conflict, Row, Tables, Write
 from function_app.services.storage import quota, records
@@ -75,7 +76,7 @@ class Retention:
             try:
                 if await self._done(note, now_ms):
                     await self._tables.delete(records.FORGET, note)
-            except Conflict:
+            except (Conflict, Problem):
                 _log.debug("another process executes %s, or a row has changed; retrying in the next run", note.key)
 
     async def _done(self, note: Row, now_ms: int) -> bool:

@@ -242,8 +242,8 @@ class Uploads:
                     if deletion.data.get("account"):
                         await quota.release(self._tables, deletion.data["account"], _blob(partition, id_))
                 await self._tables.delete(records.UPLOADS, deletion)
-            except Conflict:
-                _log.debug("another process deletes %s", deletion.key)
+            except (Conflict, Problem):
+                _log.debug("another process deletes %s, or a row has changed", deletion.key)
 
     async def _stored(self, device: Device, upload: str) -> StoredCapture:
         row = await self._tables.get(records.UPLOADS, _partition(device), _registered(upload[:_ID]))

@@ -11,7 +11,7 @@ import pytest
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.domain.common.problems import Problem
 from function_app.ports.blobs import TransferRefused
-from function_app.ports.tables import Row
+from function_app.ports.tables import Conflict, Row
 from function_app.services.storage import records
 from function_app.services.storage.quota import Usage, release
 from function_app.services.telemetry.uploads import SHARDS, UNREGISTERED_MS
@@ -85,6 +85,31 @@ def test_concurrent_reservations_never_exceed_the_limit(alone: Cloud) -> None:
     assert alone.run(alone.functions.quota.usage("other")).total_bytes == 0
 
 
+def test_requests_of_one_process_do_not_conflict_in_a_store_with_latency(
+    alone: Cloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tables = alone.functions.tables
+    get, batch, batches = tables.get, tables.batch, 0
+
+    async def late_get(*place: str) -> Row | None:
+        await asyncio.sleep(0)
+        return await get(*place)
+
+    async def counted_batch(table: str, writes: Any) -> Any:
+        nonlocal batches
+        batches += 1
+        return await batch(table, writes)
+
+    monkeypatch.setattr(tables, "get", late_get)
+    monkeypatch.setattr(tables, "batch", counted_batch)
+
+    async def reserve_many() -> None:
+        await asyncio.gather(*(alone.functions.quota.reserve("anna", f"blob-{number}", KB) for number in range(20)))
+
+    alone.run(reserve_many())
+    assert (used(alone, "anna"), batches) == (20 * KB, 20)
+
+
 def test_the_sums_of_a_former_version_are_counted_once(alone: Cloud) -> None:
     tables, quota = alone.functions.tables, alone.functions.quota
     limit(alone, account_bytes=4 * KB, device_bytes=3 * KB)
@@ -120,6 +145,36 @@ def test_a_reservation_reads_no_other_blobs(alone: Cloud, monkeypatch: pytest.Mo
     monkeypatch.setattr(tables, "query", None)
     alone.run(quota.reserve("anna", "captures/b", KB))
     assert alone.run(quota.usage("anna")).total_bytes == 2 * KB
+
+
+def test_a_deletion_that_cannot_change_the_sums_is_repeated(
+    cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tables = cloud.functions.tables
+    batch = tables.batch
+
+    async def conflict(table: str, writes: Any) -> Any:
+        if table == records.USAGE:
+            raise Conflict("changed")
+        return await batch(table, writes)
+
+    def delete_due() -> None:
+        for _ in range(SHARDS):
+            cloud.run(cloud.functions.uploads.delete_due())
+        for _ in range(3):
+            cloud.run(cloud.functions.retention.delete_due(cloud.clock.now_ms()))
+
+    begin(anna, robot)
+    anna.put("/robot-types/ur5/movements/mine", SCRIPT)
+    anna.delete("/robot-types/ur5/movements/mine")
+    counted = used(cloud, anna.account)
+    cloud.clock.advance(4 * 86_400)
+    with monkeypatch.context() as contended:
+        contended.setattr(tables, "batch", conflict)
+        delete_due()
+        assert used(cloud, anna.account) == counted == KB + len(SCRIPT["source"])
+    delete_due()
+    assert used(cloud, anna.account) == 0
 
 
 def test_scripts_count_until_their_blob_is_deleted(cloud: Cloud, anna: Person) -> None:
