@@ -74,11 +74,11 @@ not from there to the end (46.5 and 46.3 MB). Its objects were counted in minute
 run of 99 minutes (counted after one hour; the total after 49 minutes) had 20,383 requests, 2,497 actions and no errors.
 Other programs had idle priority. The functions grew by 0.03 MB per minute, and in three steps of 0.3 to 0.7 MB. In
 the run of 108 minutes (2026-11-29, counted after 54 minutes; 21,437 requests, 2,630 actions, no errors, beside programs
-with idle priority), functions, worker and agent each made one step of about 1 MB in the first hour. In a run with more
-requests per minute, such a step of the functions was Python's table of interned strings, which doubled. The functions
-grew by a further 1.5 MB in the second hour. They read all stored sizes for each recorded segment, and no longer do. The broker grew by 0.01 MB per minute, also with four times as many
-connections per minute, so its cause is not the connections; it is not known yet. The worker did not
-grow after its step.""",
+with idle priority), functions, worker and agent each made one step of about 1 MB in the first hour. In a run with
+more requests per minute, such a step of the functions was Python's table of interned strings, which doubled. The
+functions grew by a further 1.5 MB in the second hour. They read all stored sizes for each recorded segment, and no
+longer do. The broker grew by 0.01 MB per minute, also with four times as many connections per minute, so its cause
+is not the connections; it is not known yet. The worker did not grow after its step.""",
 )
 
 
