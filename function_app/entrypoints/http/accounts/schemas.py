@@ -138,7 +138,10 @@ class AccessToken(Response, frozen=True, kw_only=True):
 
 
 class StorageOut(Response, frozen=True, kw_only=True):
-    """Stored captures, movements and robot types of an account [bytes]; ``devices``: captures by device."""
+    """Stored recordings, captures, movements and robot types of an account [bytes].
+
+    ``devices``: recordings and captures by device.
+    """
 
     used_bytes: int
     limit_bytes: int

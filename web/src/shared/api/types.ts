@@ -10,7 +10,7 @@ export interface Account {
   administrator: boolean;
 }
 
-/** Stored captures, movements and robot types of the account. */
+/** Stored recordings, captures, movements and robot types of the account [bytes]. */
 export interface StorageUsage {
   used_bytes: number;
   limit_bytes: number;
