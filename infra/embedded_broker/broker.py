@@ -31,7 +31,7 @@ from infra.embedded_broker.limits import Limits
 from infra.embedded_broker.listeners import CLOSE_S, TcpTransport, Transport, WebSocketTransport
 from infra.embedded_broker.packets import Connect
 from infra.embedded_broker.public_keys import KeyRing, KeysError
-from infra.embedded_broker.revocations import Revocations
+from infra.embedded_broker.revocations import ACCOUNT, Revocations
 from infra.embedded_broker.routing import RetainedMessage, RetainedMessages, Subscriptions
 
 log = logging.getLogger("telescope.broker")
@@ -195,8 +195,7 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         now_s = time.time()
         if now_s >= grant.expires_at:
             raise Refused(packets.NOT_AUTHORISED, "the token has expired")
-        service = grant.principal.startswith(_SERVICE)
-        longest_s = self.limits.service_token_s if service else self.limits.token_s
+        longest_s = self._longest_s(grant.principal)
         if grant.expires_at - now_s > longest_s:
             raise Refused(packets.NOT_AUTHORISED, f"the token's lifetime exceeds {longest_s:.0f} s")
         admission = Admission(grant, connect.password, issued_at(connect.password))
@@ -204,6 +203,12 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
             raise Refused(packets.NOT_AUTHORISED, "the token has been revoked")
         self._require_room(grant)
         return admission
+
+    def _longest_s(self, principal: str) -> float:
+        """Maximum remaining lifetime of a token of this principal [s]."""
+        if principal.startswith(_SERVICE):
+            return self.limits.service_token_s
+        return self.limits.account_token_s if principal.startswith(ACCOUNT) else self.limits.token_s
 
     def _require_room(self, grant: Grant) -> None:
         """Reject a client above the limit. A part of it is reserved for agents and for the functions."""

@@ -27,8 +27,10 @@ class Limits:
         queued_bytes: The same in payload [bytes].
         congested_bytes: Unsent data above which QoS 0 messages are dropped [bytes].
         unsent_bytes: Unsent data above which the connection is closed [bytes].
-        token_s: Maximum remaining lifetime of a token of an account or agent [s]; revocations are stored that long.
-            The functions issue them for at most one hour.
+        token_s: Maximum remaining lifetime of a token of an agent [s]; revocations are stored that long. The functions
+            issue them for one hour.
+        account_token_s: The same for an account, for whose tokens there are many more revocations: each sign-out is
+            one. The functions issue them for at most fifteen minutes.
         service_token_s: The same for the functions and gateways, whose tokens are not revoked [s].
     """
 
@@ -50,6 +52,7 @@ class Limits:
     congested_bytes: int = 256 * 1024
     unsent_bytes: int = 4 * 1024 * 1024
     token_s: float = 2 * 3_600.0
+    account_token_s: float = 1_800.0
     service_token_s: float = 25 * 3_600.0
 
     def within(self, descriptors: int) -> "Limits":

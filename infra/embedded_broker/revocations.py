@@ -12,6 +12,8 @@ import msgspec
 from device_agent.protocol.security.grants import Grant, covering
 from device_agent.protocol.security.revocation import Revoke
 
+ACCOUNT = "account:"
+"""Beginning of the principals of accounts."""
 _SWEEP_S = 60.0
 """Interval between removals of expired revocations from memory [s]."""
 _REWRITE_AT = 1_000
@@ -34,14 +36,15 @@ class Revocations:
     """Revocations by token id, client id or principal.
 
     The file has one JSON object per line and is appended to. ``open``, and growth, rewrite it without expired entries.
-    Memory holds the revocations of the last ``keep_s`` and one sweep.
+    Memory holds those that may still cover a valid token, and those of one sweep.
     A line truncated by a crash is ignored.
     """
 
-    def __init__(self, path: Path, *, keep_s: float) -> None:
-        """Keep revocations for ``keep_s`` [s], the maximum lifetime of a token."""
+    def __init__(self, path: Path, *, keep_s: float, account_keep_s: float) -> None:
+        """Keep revocations for the maximum lifetime of a token [s], by principal for accounts ``account_keep_s``."""
         self._path = path
         self._keep_s = keep_s
+        self._account_keep_s = account_keep_s
         self._before: dict[tuple[str, str], float] = {}
         self._file: IO[str] | None = None
         self._lines = 0
@@ -53,11 +56,10 @@ class Revocations:
         Raises:
             RevocationsError: It cannot be read or written.
         """
-        oldest = time.time() - self._keep_s
         try:
             for entry in self._entries():
-                if entry.before_s >= oldest:
-                    self._store(entry)
+                self._store(entry)
+            self._remove_expired()
             self._rewrite()
         except OSError as error:
             raise RevocationsError(f"cannot store revocations in {self._path}: {error.strerror}") from error
@@ -110,8 +112,13 @@ class Revocations:
     def _remove_expired(self) -> None:
         """Remove entries that can no longer cover a valid token."""
         self._swept_s = time.monotonic()
-        oldest = time.time() - self._keep_s
-        self._before = {key: before for key, before in self._before.items() if before >= oldest}
+        now_s = time.time()
+        self._before = {key: before for key, before in self._before.items() if now_s - before <= self._longest_s(*key)}
+
+    def _longest_s(self, field: str, value: str) -> float:
+        """Maximum lifetime of the tokens that a revocation covers [s]."""
+        account = field == "principal" and value.startswith(ACCOUNT)
+        return self._account_keep_s if account else self._keep_s
 
     def _rewrite(self) -> None:
         """Replace the file by the current entries."""

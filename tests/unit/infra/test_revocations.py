@@ -24,8 +24,9 @@ def path(tmp_path: Path) -> Path:
 def open_file(path: Path) -> Iterator[Opener]:
     with contextlib.ExitStack() as stack:
 
-        def open_again(keep_s: float = 1_000) -> Revocations:
-            revocations = stack.enter_context(contextlib.closing(Revocations(path, keep_s=keep_s)))
+        def open_again(keep_s: float = 1_000, account_keep_s: float = 1_000) -> Revocations:
+            revocations = Revocations(path, keep_s=keep_s, account_keep_s=account_keep_s)
+            stack.enter_context(contextlib.closing(revocations))
             revocations.open()
             return revocations
 
@@ -78,6 +79,18 @@ def test_expired_revocations_are_removed_from_memory_once_per_sweep(
     assert not revocations.covers(GRANT, 0.0)
 
 
+def test_revocations_of_accounts_are_removed_earlier(open_file: Opener, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_SWEEP_S", 0.0)
+    revocations, now = open_file(keep_s=200, account_keep_s=50), time.time()
+    for principal, age_s in (("agent:a", 100), ("account:old", 100), ("account:a", 40)):
+        revocations.add(Revoke(principal=principal, before_s=now - age_s))
+    assert [value for _, value in revocations._before] == ["agent:a", "account:a"]
+    revocations.close()
+    again = open_file(keep_s=200, account_keep_s=30)
+    assert [value for _, value in again._before] == ["agent:a"]
+    assert again.covers(msgspec.structs.replace(GRANT, principal="agent:a"), now - 101)
+
+
 def test_the_file_is_rewritten_when_half_of_it_has_expired(
     open_file: Opener, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,4 +132,4 @@ def test_a_revocation_names_exactly_one_field(open_file: Opener, revoke: Revoke)
 
 def test_an_unusable_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(RevocationsError, match="cannot store revocations"):
-        Revocations(tmp_path / "none" / "r", keep_s=1).open()
+        Revocations(tmp_path / "none" / "r", keep_s=1, account_keep_s=1).open()
