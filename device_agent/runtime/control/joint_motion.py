@@ -21,6 +21,10 @@ _SLOWDOWN_SAMPLES = 4
 _REST_RAD_S = 1e-6
 _ROUNDING = 1e-12
 _REDUCED_SPEED = 0.999
+_ACCELERATION_SHARE = 0.9997
+"""Share of the acceleration limit that a motion uses. For a motion of 2 a³/j², which only just reaches it, ``ruckig``
+0.19 finds no trajectory, or one of many minutes. Round limits and positions make that likely; this share does not.
+"""
 _REACHED_RAD = 1e-4
 _SAME_RAD_S2 = 1e-3
 
@@ -64,6 +68,7 @@ class JointMotion:
         self._period_s = robot_type.period_ms / 1000
         self._velocity_limits = [joint.max_velocity_rad_s for joint in joints]
         self._acceleration_limits = [joint.max_acceleration_rad_s2 for joint in joints]
+        self._used_rad_s2 = [_ACCELERATION_SHARE * limit for limit in self._acceleration_limits]
         self._jerk_limits = [joint.max_jerk_rad_s3 for joint in joints]
         self._braking = robot_type.braking_rad_s2
         self._generator = Ruckig(len(joints), self._period_s)
@@ -131,7 +136,7 @@ class JointMotion:
         if max_rad_s is not None:
             fastest = [min(pair) for pair in zip(fastest, max_rad_s, strict=True)]
         self._input.max_velocity = fastest
-        self._input.max_acceleration = self._acceleration_limits
+        self._input.max_acceleration = self._used_rad_s2
         self._input.max_jerk = self._jerk_limits
         self._input.target_position = self._period_target()
         self._input.target_velocity = self._zeros

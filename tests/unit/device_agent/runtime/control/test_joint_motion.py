@@ -33,6 +33,25 @@ def test_a_trajectory_that_starts_elsewhere_is_not_followed() -> None:
     assert 0.4 < motion.position_rad[0] < 0.7, "the joint rests on its trajectory"
 
 
+@pytest.mark.parametrize("acceleration", [1.0, 2.0, 4.0, 5.0])
+@pytest.mark.parametrize("end", [0.1, 0.0, -0.3])
+def test_a_motion_that_only_just_reaches_the_acceleration_limit_is_possible(acceleration: float, end: float) -> None:
+    """``ruckig`` itself finds no trajectory for some of these starts, which differ by rounding only."""
+    limits = {"max_velocity_rad_s": 2.0, "max_acceleration_rad_s2": acceleration, "max_jerk_rad_s3": 5 * acceleration}
+    kind = robot_type()
+    kind = msgspec.structs.replace(
+        kind, joints=tuple(msgspec.structs.replace(joint, **limits) for joint in kind.joints)
+    )
+    shortest_rad = 2 * acceleration**3 / limits["max_jerk_rad_s3"] ** 2
+    for rounding in (0.0, 5e-17, 1.1e-16, 2.2e-16, -5.5e-17, -2.2e-16):
+        motion = JointMotion(kind)
+        motion.start_at([end + shortest_rad + rounding] * len(kind.joints))
+        for _ in range(400):
+            motion.follow([end] * len(kind.joints))
+            motion.update()
+        assert motion.position_rad == pytest.approx([end] * len(kind.joints))
+
+
 def test_a_device_without_joints_needs_no_plan() -> None:
     motion = JointMotion(msgspec.structs.replace(robot_type(), joints=(), home_rad={}))
     assert motion.propose() == [[], []]
