@@ -61,6 +61,8 @@ class LeaseObject:
             case "take_over":
                 return [self._held(epoch, holder, call)] if epoch > state.epoch else []
             case "accept":
+                if (state.epoch, state.holder) == (epoch, call.arguments["to"]):
+                    return [state]  # the requester asked twice and got one request, which was accepted before
                 # An action may have a lease of its own, which no response names.
                 of_action = call.arguments["epoch"] > state.epoch
                 live = of_action or self._is_held(state, holder, call.arguments["epoch"], call)
