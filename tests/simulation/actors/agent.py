@@ -197,17 +197,18 @@ class AgentMachine:
 
     def request_credentials(self) -> BrokerTicket | None:
         """Broker credentials; ``None`` if the agent was unpaired. Raises ``OSError``."""
+        pairing = self.pairing
 
         async def request(functions: "Functions") -> BrokerTicket | None:
             _, row = await records.find(functions.tables, records.AGENTS, self.id, "agent", AgentRow)
-            if row is None or not row.claimed or self.pairing is None or row.space != self.pairing.space:
+            if row is None or not row.claimed or pairing is None or row.space != pairing.space:
                 return None
             issued = await functions.mqtt_credentials.agent(row)
             assert issued.confirmations is not None
             return BrokerTicket(row.space, issued.client_id, issued.credentials, issued.subscribe, issued.confirmations)
 
         ticket: BrokerTicket | None = self._http(request)
-        if ticket is None:
+        if ticket is None and self.pairing is pairing:  # not paired again while the response was on its way
             self.unpaired()
         return ticket
 
