@@ -21,6 +21,7 @@ class ActionFact:
     Attributes:
         issued_s: When it was created or left the queue, virtual time [s].
         exempt: Whether its terminal state is not compared with the robot's: it was open in a restored backup.
+        epoch: Epoch of its command.
     """
 
     status: Status
@@ -29,6 +30,7 @@ class ActionFact:
     issued_s: float = 0.0
     code: str = ""
     exempt: bool = False
+    epoch: int = 0
 
 
 class RowChecks:
@@ -88,11 +90,12 @@ class RowChecks:
         elif status is not fact.status:
             if fact.status.terminal:
                 self._history.violate("terminal-changed", f"action {action[-6:]}: {fact.status.value} → {status.value}")
-            elif status.rank < fact.status.rank:
+            elif status.rank < fact.status.rank and data["epoch"] == fact.epoch:  # else its command was issued again
                 self._history.violate("step-back", f"action {action[-6:]}: {fact.status.value} → {status.value}")
             if fact.status is Status.QUEUED:
                 fact.issued_s = self._now_s()
             fact.status = status
+        fact.epoch = data["epoch"]
         fact.code = (data.get("reason") or {}).get("code", "")
         self._history.note("cloud", f"action {action[-6:]} {status.value} {fact.code}".rstrip())
 
