@@ -75,8 +75,9 @@ class RowChecks:
             if row.key.startswith(_ACTION):
                 self._action(row.data)
                 fact = self.actions[row.data["id"]]
-                fact.issued_s = self._dropped[row.data["id"]].issued_s
-                fact.exempt = not fact.status.terminal
+                before = self._dropped[row.data["id"]]
+                fact.issued_s = before.issued_s
+                fact.exempt = before.exempt or not fact.status.terminal
             elif row.key == SLOT:
                 self._slots[row.partition] = (row.data["action"], row.data["pairing"])
             elif row.key == LEASE:
