@@ -4,6 +4,7 @@ import contextlib
 import json
 import socket
 import threading
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -139,6 +140,7 @@ def test_a_flooding_script_is_throttled(monkeypatch: pytest.MonkeyPatch) -> None
         killed = threading.Event()
         waited: list[float] = []
         monkeypatch.setattr(killed, "wait", waited.append)
+        monkeypatch.setattr(script_action, "time", SimpleNamespace(monotonic=lambda: 0.0))  # a slow reader has credit
         lines = script_action._LineReader(agent_end, killed)
         script_end.sendall(b"{}\n" * 700)
         for _ in range(700):

@@ -17,6 +17,7 @@ from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.control.goals import GoalResult
 from device_agent.runtime.errors import Refused
+from device_agent.runtime.planning import motion_planner
 from device_agent.runtime.planning.motion_planner import MotionPlanner
 from tests.harness.paths import UR5
 
@@ -40,6 +41,12 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def shape(scene: Path) -> MujocoGeometry:
     return MujocoGeometry(KIND, scene)
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Searches may take long on a busy machine."""
+    monkeypatch.setattr(motion_planner, "_SEARCH_TIMEOUT_S", 120.0)
 
 
 class Physics:
