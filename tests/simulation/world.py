@@ -110,9 +110,7 @@ class World:
         await self.faults.end_all()
         await self.wait_until(lambda: not self._tasks, most_s=SETTLE_S)
         await self._settle()
-        settled.check(
-            self.history, self.monitors.rows, self.monitors.robots, longest_jump_ms=self.faults.longest_jump_ms
-        )
+        settled.check(self.history, self.monitors.rows, self.monitors.robots)
         for device in self.devices:
             await self._probe(device)
         self.monitors.check_operations()

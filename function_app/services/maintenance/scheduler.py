@@ -14,6 +14,7 @@ from function_app.domain.actions.action import (
     Status,
     after_set_back,
     end,
+    is_lost,
     is_withdrawn,
     next_check_ms,
     next_step,
@@ -244,7 +245,9 @@ class Scheduler:
         location = row_location(action.id)
         if location is None:
             return
-        await self._retention.delete_row_at(records.CONTROL, *location, due_ms=action.ended_ms + self._keep_actions_ms)
+        # A late report replaces a lost end, and a forward jump of the clock loses an action that has just run.
+        ended_ms = action.times[action.status.value] if is_lost(action) else action.ended_ms
+        await self._retention.delete_row_at(records.CONTROL, *location, due_ms=ended_ms + self._keep_actions_ms)
         if action.idempotency_key:
             await self._retention.delete_row_at(
                 records.CONTROL, location[0], action.idempotency_key, due_ms=action.created_ms + KEEP_ONCE_MS

@@ -18,7 +18,6 @@ class Faults:
         self._world = world
         self._ended = False
         self.restored = self.clock_jumped = False
-        self.longest_jump_ms = 0
         self._backups: list[tuple[float, object]] = []
 
     @property
@@ -150,7 +149,6 @@ class Faults:
     async def cloud_clock(self, *, jump_ms: int) -> None:
         self._world.clocks.cloud_offset_ms += jump_ms
         self.clock_jumped = True
-        self.longest_jump_ms = max(self.longest_jump_ms, jump_ms)
 
     async def agent_clock(self, *, agent: str, jump_ms: int) -> None:
         machine = self._world.machines[agent]

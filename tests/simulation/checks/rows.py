@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from function_app.domain.actions.action import Status
+from function_app.domain.actions.action import LOST, Status
 from function_app.ports.tables import Write
 from function_app.services.devices.control_rows import LEASE, SLOT
 from function_app.services.storage import records
@@ -89,9 +89,9 @@ class RowChecks:
         if fact is None:
             fact = self.actions[action] = ActionFact(status, data["device"], data["pairing"], self._now_s())
         elif status is not fact.status:
-            if fact.status.terminal:
+            if fact.status.terminal and fact.code != LOST:  # a late report replaces a lost end
                 self._history.violate("terminal-changed", f"action {action[-6:]}: {fact.status.value} → {status.value}")
-            elif status.rank < fact.status.rank and data["epoch"] == fact.epoch:  # else its command was issued again
+            elif status.rank < fact.status.rank and data["epoch"] <= fact.epoch:  # else its command was issued again
                 self._history.violate("step-back", f"action {action[-6:]}: {fact.status.value} → {status.value}")
             if fact.status is Status.QUEUED:
                 fact.issued_s = self._now_s()

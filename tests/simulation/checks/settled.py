@@ -1,19 +1,14 @@
 """Checks after all faults have ended and the system had time to settle."""
 
-from function_app.domain.actions.action import JOURNAL_MS, LOST, Status
+from function_app.domain.actions.action import Status
 from function_app.domain.actions.queue import UNPAIRED
 from tests.simulation.checks.history import History
 from tests.simulation.checks.robots import RobotChecks
 from tests.simulation.checks.rows import RowChecks
 
 
-def check(history: History, rows: RowChecks, robots: RobotChecks, *, longest_jump_ms: int) -> None:
-    """Every action has one terminal state, and it is the one of the robot.
-
-    If the cloud's clock jumps forward by more than ``JOURNAL_MS``, an open action is lost, and its row may be so old
-    that it is deleted before the report arrives.
-    """
-    not_awaited = {UNPAIRED, LOST} if longest_jump_ms > JOURNAL_MS else {UNPAIRED}
+def check(history: History, rows: RowChecks, robots: RobotChecks) -> None:
+    """Every action has one terminal state, and it is the one of the robot."""
     at_robot = {action: status for model in robots.models.values() for action, status in model.ended.items()}
     ending = {action: status for model in robots.models.values() for action, status in model.ending.items()}
     for action, fact in rows.actions.items():
@@ -21,7 +16,7 @@ def check(history: History, rows: RowChecks, robots: RobotChecks, *, longest_jum
         ended = at_robot.get(action)
         if not fact.status.terminal:
             history.violate("not-terminal", f"{shown} in the cloud, {ended} at the robot")
-        elif fact.exempt or fact.code in not_awaited:
+        elif fact.exempt or fact.code == UNPAIRED:  # the cloud does not wait for an unpaired robot
             continue
         elif ended == "done" and fact.status is not Status.DONE:
             history.violate(f"completed-not-done ({fact.code})", f"{shown} in the cloud, completed at the robot")

@@ -113,6 +113,18 @@ def test_an_unknown_outcome_is_lost_after_a_week(cloud: Cloud, anna: Person, rob
     assert (shown["status"], shown["reason"]["code"]) == ("failed", "lost")
 
 
+def test_a_report_after_a_jump_of_the_clock_replaces_a_lost_end(
+    cloud: Cloud, anna: Person, robot: Robot, unanswered: str
+) -> None:
+    robot.publish_presence(online=False)
+    cloud.clock.advance(400 * 86_400)
+    pass_time(cloud, 120, step_s=10)
+    anna = cloud.sign_in("anna")
+    assert anna.action(unanswered)["reason"]["code"] == "lost"
+    robot.report(unanswered, AckStatus.DONE)
+    assert anna.action(unanswered)["status"] == "done"
+
+
 @pytest.mark.parametrize("gone", ["permission", "movement"])
 def test_an_unknown_outcome_remains_without_permission_or_script(
     cloud: Cloud, anna: Person, robot: Robot, gone: str
