@@ -43,7 +43,7 @@ def main() -> int:
     revocations_path: Path = arguments.revocations or arguments.keys.with_name(f"{arguments.keys.name}.revoked")
     limits = Limits().within(raise_descriptor_limit())
     keys = KeyRing(arguments.keys)
-    revocations = Revocations(revocations_path, keep_s=limits.token_s, account_keep_s=limits.account_token_s)
+    revocations = Revocations(revocations_path, lifetime_s=limits.lifetime_s)
     try:
         keys.refresh()
         revocations.open()

@@ -27,11 +27,11 @@ from device_agent.protocol.security.revocation import Control
 from function_app.entrypoints.hosts.connection_limits import ACCEPTS_PER_ITERATION, ConnectionLimits
 from infra.embedded_broker import packets
 from infra.embedded_broker.connection import Admission, Connection, Refused
-from infra.embedded_broker.limits import Limits
+from infra.embedded_broker.limits import SERVICE, Limits
 from infra.embedded_broker.listeners import CLOSE_S, TcpTransport, Transport, WebSocketTransport
 from infra.embedded_broker.packets import Connect
 from infra.embedded_broker.public_keys import KeyRing, KeysError
-from infra.embedded_broker.revocations import ACCOUNT, Revocations
+from infra.embedded_broker.revocations import Revocations
 from infra.embedded_broker.routing import RetainedMessage, RetainedMessages, Subscriptions
 
 log = logging.getLogger("telescope.broker")
@@ -39,8 +39,7 @@ log = logging.getLogger("telescope.broker")
 TCP, WEBSOCKET = "default", "websocket"
 """Listener names; the first is amqtt's default."""
 _TICK_S = 0.25
-_SERVICE = "service:"
-_PRIORITY = ("agent:", _SERVICE)
+_PRIORITY = ("agent:", SERVICE)
 """Beginnings of the principals of agents and of the functions."""
 _RESERVED_SHARE = 10
 """One in this number of clients is reserved for them."""
@@ -195,7 +194,7 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         now_s = time.time()
         if now_s >= grant.expires_at:
             raise Refused(packets.NOT_AUTHORISED, "the token has expired")
-        longest_s = self._longest_s(grant.principal)
+        longest_s = self.limits.lifetime_s(grant.principal)
         if grant.expires_at - now_s > longest_s:
             raise Refused(packets.NOT_AUTHORISED, f"the token's lifetime exceeds {longest_s:.0f} s")
         admission = Admission(grant, connect.password, issued_at(connect.password))
@@ -203,12 +202,6 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
             raise Refused(packets.NOT_AUTHORISED, "the token has been revoked")
         self._require_room(grant)
         return admission
-
-    def _longest_s(self, principal: str) -> float:
-        """Maximum remaining lifetime of a token of this principal [s]."""
-        if principal.startswith(_SERVICE):
-            return self.limits.service_token_s
-        return self.limits.account_token_s if principal.startswith(ACCOUNT) else self.limits.token_s
 
     def _require_room(self, grant: Grant) -> None:
         """Reject a client above the limit. A part of it is reserved for agents and for the functions."""

@@ -4,6 +4,10 @@ from dataclasses import dataclass, replace
 
 from device_agent.protocol import codec
 
+SERVICE = "service:"
+_ACCOUNT = "account:"
+"""Beginnings of the principals of the functions and of accounts."""
+
 
 @dataclass(frozen=True, slots=True)
 class Limits:
@@ -54,6 +58,12 @@ class Limits:
     token_s: float = 2 * 3_600.0
     account_token_s: float = 1_800.0
     service_token_s: float = 25 * 3_600.0
+
+    def lifetime_s(self, principal: str) -> float:
+        """Maximum remaining lifetime of a token of this principal; of an unknown one, if it is empty [s]."""
+        if principal.startswith(SERVICE):
+            return self.service_token_s
+        return self.account_token_s if principal.startswith(_ACCOUNT) else self.token_s
 
     def within(self, descriptors: int) -> "Limits":
         """Limits that need at most this number of connections."""

@@ -3,7 +3,7 @@
 import contextlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
@@ -12,8 +12,6 @@ import msgspec
 from device_agent.protocol.security.grants import Grant, covering
 from device_agent.protocol.security.revocation import Revoke
 
-ACCOUNT = "account:"
-"""Beginning of the principals of accounts."""
 _SWEEP_S = 60.0
 """Interval between removals of expired revocations from memory [s]."""
 _REWRITE_AT = 1_000
@@ -40,11 +38,13 @@ class Revocations:
     A line truncated by a crash is ignored.
     """
 
-    def __init__(self, path: Path, *, keep_s: float, account_keep_s: float) -> None:
-        """Keep revocations for the maximum lifetime of a token [s], by principal for accounts ``account_keep_s``."""
+    def __init__(self, path: Path, *, lifetime_s: Callable[[str], float]) -> None:
+        """``lifetime_s``: maximum lifetime of the tokens of a principal; of any, if it is empty [s].
+
+        Revocations are stored that long.
+        """
         self._path = path
-        self._keep_s = keep_s
-        self._account_keep_s = account_keep_s
+        self._lifetime_s = lifetime_s
         self._before: dict[tuple[str, str], float] = {}
         self._file: IO[str] | None = None
         self._lines = 0
@@ -94,11 +94,11 @@ class Revocations:
     def covers(self, grant: Grant, issued_at: float) -> bool:
         """Whether a grant whose token was issued at ``issued_at`` [s since 1970] is revoked.
 
-        A revocation from further ahead than ``keep_s`` was stamped by a wrong clock. No token that the broker accepts
-        can be as new, and it would lock out the principal until then.
+        A revocation from further ahead than the maximum lifetime was stamped by a wrong clock. No token that the broker
+        accepts can be as new, and it would lock out the principal until then.
         """
         fields = [("client_id", grant.client_id), *(("principal", name) for name in covering(grant.principal))]
-        latest = time.time() + self._keep_s
+        latest = time.time() + self._lifetime_s("")
         return ("token_id", grant.token_id) in self._before or any(
             issued_at <= self._before.get(name, -1.0) <= latest for name in fields
         )
@@ -113,12 +113,11 @@ class Revocations:
         """Remove entries that can no longer cover a valid token."""
         self._swept_s = time.monotonic()
         now_s = time.time()
-        self._before = {key: before for key, before in self._before.items() if now_s - before <= self._longest_s(*key)}
+        self._before = {key: before for key, before in self._before.items() if now_s - before <= self._keep_s(*key)}
 
-    def _longest_s(self, field: str, value: str) -> float:
+    def _keep_s(self, field: str, value: str) -> float:
         """Maximum lifetime of the tokens that a revocation covers [s]."""
-        account = field == "principal" and value.startswith(ACCOUNT)
-        return self._account_keep_s if account else self._keep_s
+        return self._lifetime_s(value if field == "principal" else "")
 
     def _rewrite(self) -> None:
         """Replace the file by the current entries."""

@@ -49,7 +49,7 @@ class Harness:
         (folder / "keys").write_text(json.dumps({signing.key_id(public): signing.public_text(public)}))
         self.keys = KeyRing(folder / "keys")
         self.keys.refresh()
-        self.revocations = Revocations(folder / "revoked", keep_s=1, account_keep_s=1)
+        self.revocations = Revocations(folder / "revoked", lifetime_s=lambda _: 1)
         self.broker = asyncio.run(self._create(Limits(**limits)))
 
     async def _create(self, limits: Limits) -> TelescopeBroker:

@@ -9,6 +9,7 @@ import pytest
 from device_agent.protocol.security.grants import Grant
 from device_agent.protocol.security.revocation import Revoke
 from infra.embedded_broker import revocations as module
+from infra.embedded_broker.limits import Limits
 from infra.embedded_broker.revocations import Revocations, RevocationsError
 
 GRANT = Grant(principal="p", client_id="c", publish=(), subscribe=(), token_id="t", expires_at=0)
@@ -25,8 +26,8 @@ def open_file(path: Path) -> Iterator[Opener]:
     with contextlib.ExitStack() as stack:
 
         def open_again(keep_s: float = 1_000, account_keep_s: float = 1_000) -> Revocations:
-            revocations = Revocations(path, keep_s=keep_s, account_keep_s=account_keep_s)
-            stack.enter_context(contextlib.closing(revocations))
+            limits = Limits(token_s=keep_s, account_token_s=account_keep_s)
+            revocations = stack.enter_context(contextlib.closing(Revocations(path, lifetime_s=limits.lifetime_s)))
             revocations.open()
             return revocations
 
@@ -132,4 +133,4 @@ def test_a_revocation_names_exactly_one_field(open_file: Opener, revoke: Revoke)
 
 def test_an_unusable_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(RevocationsError, match="cannot store revocations"):
-        Revocations(tmp_path / "none" / "r", keep_s=1, account_keep_s=1).open()
+        Revocations(tmp_path / "none" / "r", lifetime_s=lambda _: 1).open()
