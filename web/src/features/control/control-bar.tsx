@@ -3,7 +3,7 @@ import { useEffect, useId, useState } from "preact/hooks";
 import { accountLabel } from "../../shared/lib/account-label";
 import type { DeviceSession } from "./model/device-session";
 import type { Control } from "./model/lease";
-import { ownAction, reportedEnd } from "./model/status";
+import { availability, ownAction, reportedEnd } from "./model/status";
 import type { Watchers } from "./model/watchers";
 import { texts } from "./texts";
 import "./control-bar.css";
@@ -171,7 +171,7 @@ function describe(session: DeviceSession): [Shown, string] {
     case "handed":
       return ["handed", texts.control.handed(state.to)];
     case "none":
-      if (holder === null) return ["free", texts.control.free];
+      if (holder === null) return ["free", texts.control.free[availability(device)]];
       if (holder.mine) return ["other", texts.control.elsewhere];
       return ["other", reason === "" ? texts.control.other(name) : texts.control.tookOver(name, reason)];
   }

@@ -1,4 +1,5 @@
 import type { RequestOutcome } from "./model/control-request";
+import type { Availability } from "./model/status";
 
 export const texts = {
   control: {
@@ -9,7 +10,12 @@ export const texts = {
     taking: "Taking control…",
     mine: "You have control",
     unconfirmed: "You have control; not confirmed by the robot yet",
-    free: "Available",
+    free: {
+      available: "Available",
+      stop: "Nobody has control. Stop is active.",
+      fault: "Nobody has control. The device has a fault.",
+      unknown: "Nobody has control. The device's state is not current.",
+    } satisfies Record<Availability, string>,
     viewer: "You are a viewer of this device. Ask its owner for operator access.",
     other: (holder: string): string => `${holder} has control`,
     elsewhere: "You have control in another tab",

@@ -2,9 +2,9 @@ import { signal } from "@preact/signals-core";
 import { describe, expect, it } from "vitest";
 import type { Run, RunStatus } from "../../../src/features/actions/model";
 import type { DeviceSession } from "../../../src/features/control/model";
-import { ownAction, reportedEnd } from "../../../src/features/control/model/status";
+import { availability, ownAction, reportedEnd } from "../../../src/features/control/model/status";
 import { deliver, device, pass } from "../../support/console";
-import { DEVICE, state } from "../../support/messages";
+import { DEVICE, state, telemetry } from "../../support/messages";
 
 const WAVE = { id: "action1", kind: "run_movement", name: "wave", progress: 0 };
 
@@ -49,6 +49,26 @@ describe("the own action", () => {
     await pass(1);
     lease("ann-id", true);
     expect(ownAction(session())?.name).toBe("move joints");
+  });
+});
+
+describe("control of a device that nobody controls", () => {
+  async function shown(mode: string, rest: object = {}): Promise<string> {
+    deliver("tele/joints", telemetry({ mode }));
+    deliver("state", state(5, null, { mode, faults: [], ...rest }));
+    await pass(1);
+    return availability(device);
+  }
+
+  it("is available only while its state is current, without Stop and without a fault", async () => {
+    expect(await shown("holding")).toBe("available");
+    expect(await shown("fault")).toBe("fault");
+    const stop = { caller: "Ann", reason: "", at_ms: 1, verified: true };
+    expect(await shown("fault", { stop })).toBe("stop");
+    expect(await shown("stopped", { stop })).toBe("stop");
+    expect(await shown("holding")).toBe("available");
+    await pass(1_000);
+    expect(availability(device)).toBe("unknown");
   });
 });
 

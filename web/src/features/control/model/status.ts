@@ -1,4 +1,4 @@
-/** Why control was lost, and what this account is running. */
+/** Why control was lost, whether it is available, and what this account is running. */
 import { ended } from "../../actions/model";
 import type { DeviceStore } from "../../devices/model";
 import type { DeviceSession } from "./device-session";
@@ -18,6 +18,16 @@ export function reportedEnd(device: DeviceStore, epoch: number): ReportedEnd | n
   // The event names the holder first: "Ann's control ended: stopped by Bob".
   const code = event.data["code"];
   return { code: typeof code === "string" ? code : "", message: event.message.replace(/^.*? control ended: /, "") };
+}
+
+/** Whether a device that nobody controls can be moved once someone takes control. */
+export type Availability = "available" | "stop" | "fault" | "unknown";
+
+/** See `Availability`. "unknown": its state is not current. */
+export function availability(device: DeviceStore): Availability {
+  if (device.stopped.value || device.stopPending.value || device.stopFaulty.value) return "stop";
+  if (!device.live.value) return "unknown";
+  return (device.mode.value ?? device.state.value?.mode) === "fault" ? "fault" : "available";
 }
 
 /** The action that this account is running; `elsewhere`: from another sign-in session. `null`: none. */
