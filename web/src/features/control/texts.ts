@@ -12,9 +12,9 @@ export const texts = {
     unconfirmed: "You have control; not confirmed by the robot yet",
     free: {
       available: "Available",
-      stop: "Nobody has control. Stop is active.",
-      fault: "Nobody has control. The device has a fault.",
-      unknown: "Nobody has control. The device's state is not current.",
+      stop: "No operator has control. Stop is active.",
+      fault: "No operator has control. The device has a fault.",
+      unknown: "No operator has control. The device's state is not current.",
     } satisfies Record<Availability, string>,
     viewer: "You are a viewer of this device. Ask its owner for operator access.",
     other: (holder: string): string => `${holder} has control`,

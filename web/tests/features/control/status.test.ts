@@ -52,7 +52,7 @@ describe("the own action", () => {
   });
 });
 
-describe("control of a device that nobody controls", () => {
+describe("control of a device without an operator", () => {
   async function shown(mode: string, rest: object = {}): Promise<string> {
     deliver("tele/joints", telemetry({ mode }));
     deliver("state", state(5, null, { mode, faults: [], ...rest }));

@@ -20,7 +20,7 @@ export function reportedEnd(device: DeviceStore, epoch: number): ReportedEnd | n
   return { code: typeof code === "string" ? code : "", message: event.message.replace(/^.*? control ended: /, "") };
 }
 
-/** Whether a device that nobody controls can be moved once someone takes control. */
+/** Whether a device without an operator can be moved once an operator takes control. */
 export type Availability = "available" | "stop" | "fault" | "unknown";
 
 /** See `Availability`. "unknown": its state is not current. */
