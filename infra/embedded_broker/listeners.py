@@ -108,8 +108,10 @@ class TcpTransport(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """See ``asyncio.Protocol``."""
         del exc
-        if self._receiver is not None:
-            self._receiver.lost()
+        receiver = self._receiver
+        self._receiver = self._transport = None  # otherwise all remain until the next garbage collection
+        if receiver is not None:
+            receiver.lost()
 
     @property
     def unsent(self) -> int:

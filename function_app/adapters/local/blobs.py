@@ -7,7 +7,7 @@ import functools
 import os
 import secrets
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote, unquote
@@ -31,6 +31,7 @@ _READABLE = 3 * MAX_NAME_LENGTH
 """Names whose percent encoding is longer than this are encoded in base64: a path has at most 4,096 bytes."""
 _COMPACT = "~"
 _SUFFIX = ".blob"
+_FOLDER = "+"
 _TEMPORARY = ".part"
 _ABANDONED_S = 86_400
 _SWEEP_S = 3600.0
@@ -237,13 +238,31 @@ class FileBlobs:
             raise _unusable(path, error) from error
 
     def _list(self, prefix: str, limit: int) -> tuple[str, ...]:
-        names = []
-        for path in self._folder.rglob(f"*{_SUFFIX}"):
-            *folders, last = path.relative_to(self._folder).parts
-            name = _decode("".join(part.removesuffix("+") for part in folders) + last.removesuffix(_SUFFIX))
-            if name.startswith(prefix):
-                names.append(name)
+        # A readable name begins with its encoded prefix. A compact one must be decoded.
+        found = {*_names(self._folder, "", _percent_encoded(prefix)), *_names(self._folder, "", _COMPACT)}
+        names = [name for name in map(_decode, found) if name.startswith(prefix)]
         return tuple(sorted(names)[:limit])
+
+
+def _names(folder: str | Path, parents: str, prefix: str) -> Iterator[str]:
+    """The encoded names below a folder that begin with ``prefix``; the folder's own encoded name is ``parents``.
+
+    Opens only folders of such names, and keeps one entry at a time. ``Path.rglob`` keeps all paths until its end.
+    """
+    try:
+        entries = os.scandir(folder)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise _unusable(folder, error) from error
+    with entries:
+        for entry in entries:
+            name = parents + entry.name.removesuffix(_SUFFIX).removesuffix(_FOLDER)
+            if entry.name.endswith(_SUFFIX):
+                if name.startswith(prefix):
+                    yield name
+            elif entry.name.endswith(_FOLDER) and name.startswith(prefix[: len(name)]):
+                yield from _names(entry.path, name, prefix)
 
 
 async def _parts(file: BinaryIO) -> AsyncGenerator[bytes, None]:
@@ -268,16 +287,19 @@ def _relative_path(name: str) -> Path:
     check_name(name)
     encoded = _encode(name)
     parts = [encoded[start : start + _PART] for start in range(0, len(encoded), _PART)]
-    return Path(*(f"{part}+" for part in parts[:-1]), parts[-1] + _SUFFIX)
+    return Path(*(part + _FOLDER for part in parts[:-1]), parts[-1] + _SUFFIX)
 
 
 def _encode(name: str) -> str:
     """A name in characters that every file system accepts; percent-encoded if short enough."""
-    text = name.encode()
-    readable = quote(text, safe="").replace(".", "%2E").replace(_COMPACT, "%7E")
+    readable = _percent_encoded(name)
     if len(readable) <= _READABLE:
         return readable
-    return _COMPACT + base64.urlsafe_b64encode(text).decode().rstrip("=")
+    return _COMPACT + base64.urlsafe_b64encode(name.encode()).decode().rstrip("=")
+
+
+def _percent_encoded(text: str) -> str:
+    return quote(text.encode(), safe="").replace(".", "%2E").replace(_COMPACT, "%7E")
 
 
 def _decode(encoded: str) -> str:
@@ -287,5 +309,5 @@ def _decode(encoded: str) -> str:
     return base64.urlsafe_b64decode(compact + "=" * (-len(compact) % 4)).decode()
 
 
-def _unusable(path: Path, error: OSError) -> StoreError:
+def _unusable(path: str | Path, error: OSError) -> StoreError:
     return StoreError(f"the blob {path} cannot be used: {error.strerror}. Check disk space and permissions.")

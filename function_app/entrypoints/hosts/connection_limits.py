@@ -56,6 +56,7 @@ class AcceptedSocket(socket.socket):
     def close(self) -> None:
         """Close the socket, and count it no more."""
         self.limits.remove(self)
+        self.transport = None  # otherwise both remain until the next garbage collection
         super().close()
 
     def end(self) -> None:

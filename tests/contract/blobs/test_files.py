@@ -5,6 +5,7 @@ import base64
 import os
 import socket
 import time
+import tracemalloc
 from collections.abc import AsyncIterator, Awaitable
 from pathlib import Path
 from typing import IO, Any
@@ -99,6 +100,31 @@ async def test_an_unusable_folder_is_named(blobs: Blobs, tmp_path: Path) -> None
             await call
         assert str(tmp_path / "blobs") in str(caught.value)
         assert "\n" not in str(caught.value)
+
+
+async def test_each_prefix_finds_its_names(blobs: Blobs, tmp_path: Path) -> None:
+    names = {"a", "a/b", "ab", "~a", "%2F", "+", "é" * 30, *("x" * length for length in (119, 120, 121, 241, 500))}
+    names |= {f"x{'/' * length}y" for length in (38, 39, 40, 41, 80, 120)}
+    names |= {"\U0001f916" * 256, f"\U0001f916/{chr(0x10348) * 250}"}
+    for name in names:
+        await blobs.put(name, b"x")
+    assert list((tmp_path / "blobs").glob("~*")), "the longest names are encoded in base64"
+    for prefix in {name[:length] for name in names for length in range(len(name) + 1)}:
+        assert await blobs.list(prefix) == tuple(sorted(name for name in names if name.startswith(prefix)))
+
+
+async def test_a_list_does_not_keep_the_names_of_other_blobs(blobs: Blobs, tmp_path: Path) -> None:
+    """It kept the paths of all: lists of a server grew with each recorded segment."""
+    await blobs.put("a/0", b"x")
+    for number in range(3_000):
+        (tmp_path / "blobs" / f"recordings%2F{number:0100}.blob").touch()
+    tracemalloc.start()
+    try:
+        assert await blobs.list("a/") == ("a/0",)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < 300_000
 
 
 async def test_a_cancelled_download_closes_the_file(blobs: FileBlobs, monkeypatch: pytest.MonkeyPatch) -> None:

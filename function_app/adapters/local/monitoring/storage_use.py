@@ -27,10 +27,12 @@ class StorageUse:
         return {"tables": sum(file.stat().st_size for file in files), "blobs": self._blob_bytes}
 
 
-def _size(folder: Path) -> int:
+def _size(folder: str | Path) -> int:
+    """The sizes of all files below a folder. Keeps one entry at a time."""
     total = 0
-    for parent, _, names in os.walk(folder):
-        for name in names:
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
             with contextlib.suppress(OSError):  # deleted meanwhile
-                total += Path(parent, name).stat().st_size
+                is_folder = entry.is_dir(follow_symlinks=False)
+                total += _size(entry.path) if is_folder else entry.stat(follow_symlinks=False).st_size
     return total
