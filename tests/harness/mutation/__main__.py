@@ -1,6 +1,7 @@
-"""Tests mutants: ``python -m tests.harness.mutation [--sample N] [--seed TEXT] [--workers N] [--page] [package …]``.
+"""Tests mutants: ``python -m tests.harness.mutation [option …] [package …]``; ``--help`` lists the options.
 
-Exits with 1 if a package's score is too low, or a mutant survived that is not in ``survivors``.
+Exits with 1 if a package's score is too low, a mutant survived that is not in ``survivors``, or the run was
+interrupted.
 """
 
 import argparse
@@ -19,16 +20,27 @@ def main() -> int:
     parser.add_argument("--seed", default="0", help="chooses the sample")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--page", action="store_true", help="write docs/results/mutation.md")
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="continue the previous run: test only mutants of changed files, untested ones, and those that survived",
+    )
     arguments = parser.parse_args()
     os.chdir(ROOT)
-    names = mutants.generate()
+    names = mutants.generate(resume=arguments.resume)
     sample = {
         package: random.Random(arguments.seed).sample(
             names[package], min(arguments.sample or sys.maxsize, len(names[package]))
         )
         for package in arguments.packages or names
     }
-    mutants.run([name for chosen in sample.values() for name in chosen], arguments.workers)
+    chosen = [name for each in sample.values() for name in each]
+    previous = mutants.statuses()
+    mutants.run([name for name in chosen if previous[name] not in report.DETECTED], arguments.workers)
+    statuses = mutants.statuses()
+    if any(statuses[name] in mutants.UNTESTED for name in chosen):
+        print("interrupted; run the command again with --resume", file=sys.stderr)
+        return 1
     listed = report.read_listed()
     scores = {
         package: report.score(mutants.results(package, chosen), listed, len(names[package]))

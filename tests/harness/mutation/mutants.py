@@ -24,7 +24,7 @@ from mutmut.stats import status_by_exit_code
 from mutmut.utils.format_utils import orig_function_and_class_names_from_key
 from mutmut.workers.isolation import ForkServerRunner
 
-from tests.harness.mutation.report import Mutant
+from tests.harness.mutation.report import DETECTED, Mutant
 from tests.harness.paths import ROOT
 
 PACKAGES: Final = {
@@ -40,11 +40,16 @@ PACKAGES: Final = {
 }
 """Package → files to mutate."""
 FOLDER: Final = ROOT / "mutants"
+UNTESTED: Final = frozenset({"not checked", "check was interrupted by user"})
+"""Results of mutants that an interrupted run left."""
 _LOG_CALL: Final = matchers.Call(func=matchers.Attribute(value=matchers.Name("_log")))
 
 
-def generate() -> dict[str, list[str]]:
-    """Writes the mutated sources next to a copy of all other files; returns the names of the mutants per package."""
+def generate(*, resume: bool = False) -> dict[str, list[str]]:
+    """Writes the mutated sources next to a copy of all other files; returns the names of the mutants per package.
+
+    ``resume`` keeps the results of unchanged sources.
+    """
     mutation_operators[:] = [
         *((node, _code_strings if operator is operator_string else operator) for node, operator in mutation_operators),
         (libcst.Expr, _without_call),
@@ -53,7 +58,8 @@ def generate() -> dict[str, list[str]]:
     config().only_mutate = [pattern for patterns in PACKAGES.values() for pattern in patterns]
     config().also_copy = []
     mutmut.get_mutant_runner = lambda workers=1: _Runner(workers, _PytestRunner, {})
-    shutil.rmtree(FOLDER, ignore_errors=True)
+    if not resume:
+        shutil.rmtree(FOLDER, ignore_errors=True)
     _copy_other_files()
     mutmut.copy_src_dir()
     mutmut.create_mutants(1)
@@ -61,8 +67,15 @@ def generate() -> dict[str, list[str]]:
 
 
 def run(names: Sequence[str], workers: int) -> None:
-    """Tests the mutants with these names; none means all."""
-    mutmut._run(tuple(names), workers)
+    """Tests the mutants with these names."""
+    if names:  # mutmut takes none as all
+        mutmut._run(tuple(names), workers)
+
+
+def statuses() -> dict[str, str]:
+    """The present result of each mutant by its name."""
+    files = (file for package in PACKAGES for file in _data(package))
+    return {name: status_by_exit_code[code] for file in files for name, code in file.exit_code_by_key.items()}
 
 
 def results(package: str, names: Iterable[str]) -> Iterator[Mutant]:
@@ -78,7 +91,7 @@ def mutant(name: str, status: str, path: Path | str) -> Mutant:
     """A mutant with its mutation."""
     function, owner = orig_function_and_class_names_from_key(name)
     module = str(path).removesuffix(".py").replace("/", ".")
-    lines = get_diff_for_mutant(name, path=path).splitlines()[2:] if status not in {"killed", "timeout"} else []
+    lines = get_diff_for_mutant(name, path=path).splitlines()[2:] if status not in DETECTED else []
     before, after = (" ".join(line[1:].strip() for line in lines if line[0] == sign) for sign in "-+")
     return Mutant(".".join(filter(None, (module, owner, function))), f"{before} → {after}", status)
 

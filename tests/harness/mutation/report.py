@@ -12,6 +12,8 @@ LISTED: Final = Path(__file__).with_name("survivors")
 """Folder with one file for each package."""
 REQUIRED: Final = 0.9
 """Share of a package's mutants that tests must detect."""
+DETECTED: Final = frozenset({"killed", "timeout"})
+"""Results of mutants that tests detect."""
 Z: Final = 1.96
 """Quantile of the normal distribution for an interval of 95 %."""
 
@@ -27,7 +29,7 @@ class Mutant:
     @property
     def survived(self) -> bool:
         """Whether no test failed."""
-        return self.status not in {"killed", "timeout"}
+        return self.status not in DETECTED
 
     @property
     def text(self) -> str:
