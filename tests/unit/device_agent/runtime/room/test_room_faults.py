@@ -8,7 +8,16 @@ import pytest
 
 from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.sensor import Frame, SensorError
-from device_agent.protocol import CollectData, Mode, ResetStop, SetControl, StopDevice, TakePicture, camera_frames
+from device_agent.protocol import (
+    CollectData,
+    Mode,
+    ResetStop,
+    SetControl,
+    State,
+    StopDevice,
+    TakePicture,
+    camera_frames,
+)
 from device_agent.protocol.codec import MAX_BYTES
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.manifests.room import Watch
@@ -150,10 +159,13 @@ def test_a_dead_loop_holds_at_a_stop_is_reported_and_is_started_again(make_room_
     crash(harness.device._loop._thread)
     harness.receive_stop()
     assert harness.sensor.holds == 1
+    harness.sensor.broken = "no answer"  # until then, the loop that is started again stays in the mode "fault"
     assert supervisor.check() == ""
-    harness.sensor.broken = "no answer"
-    state = wait_for_state(harness, lambda state: any(fault.code == "agent.sensor-loop" for fault in state.faults))
-    assert state.mode is Mode.FAULT
+
+    def reported(state: State) -> bool:
+        return state.mode is Mode.FAULT and any(fault.code == "agent.sensor-loop" for fault in state.faults)
+
+    wait_for_state(harness, reported)
     harness.sensor.broken = ""
     eventually(lambda: not supervisor.check() and harness.events(EventKind.PART_RECOVERED))
     wait_for_state(harness, lambda state: not state.faults and state.mode is Mode.STOPPED)
