@@ -10,6 +10,11 @@ describe("formats", () => {
     const ages = [0, 59_000, 61_000, 3_700_000, 200_000_000].map(format.age);
     expect(ages).toEqual(["just now", "59 s ago", "1 min ago", "1 h ago", "2 days ago"]);
   });
+
+  it("show a size in its largest fitting unit", () => {
+    const sizes = [0, 1, 999_000, 1_250_000, 20_000_000_000].map(format.fileSize);
+    expect(sizes).toEqual(["0 kB", "1 kB", "999 kB", "1.3 MB", "20.0 GB"]);
+  });
 });
 
 describe("topics", () => {

@@ -40,7 +40,7 @@ export const texts = {
     changed: "Password set.",
     storage: "Storage",
     used: (usedBytes: number, limitBytes: number): string =>
-      `${format.oneDigit(usedBytes / 1e6)} MB of ${Math.round(limitBytes / 1e6)} MB are in use by recordings, captures, movements and robot types.`,
+      `${format.fileSize(usedBytes)} of ${format.fileSize(limitBytes)} are in use by recordings, captures, movements and robot types.`,
     sessions: "Active sessions",
     session: (how: string, since: string, used: string): string =>
       `Signed in by ${how} on ${format.dateTime(since)}, last used ${format.dateTime(used)}`,

@@ -42,7 +42,9 @@ export const format = {
   utcDay: (ms: number): string => utcDayFormat.format(ms),
   /** Without the day if less than twelve hours ago. */
   recentTime: (ms: number): string => (Date.now() - ms < 12 * 3_600_000 ? timeFormat : dayAndTimeFormat).format(ms),
-  fileSize: (bytes: number): string =>
-    bytes < 1_000_000 ? `${Math.max(1, Math.round(bytes / 1000))} kB` : `${(bytes / 1e6).toFixed(1)} MB`,
+  fileSize: (bytes: number): string => {
+    if (bytes < 1e6) return `${bytes && Math.max(1, Math.round(bytes / 1e3))} kB`;
+    return bytes < 1e9 ? `${(bytes / 1e6).toFixed(1)} MB` : `${(bytes / 1e9).toFixed(1)} GB`;
+  },
   count: (count: number, noun: string): string => `${count} ${noun}${count === 1 ? "" : "s"}`,
 };

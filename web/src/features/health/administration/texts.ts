@@ -38,7 +38,7 @@ export const texts = {
     blobs: "Size of the blobs",
     free: "Free disk space",
   },
-  size: (bytes: number | null): string => (bytes === null ? "in the cloud" : bytes < 1e9 ? format.fileSize(bytes) : `${(bytes / 1e9).toFixed(1)} GB`),
+  size: (bytes: number | null): string => (bytes === null ? "in the cloud" : format.fileSize(bytes)),
   errors: "Recent warnings and errors",
   errorsExplained: "Of the server and its workers since their start. Each text appears once, with its newest time.",
   noErrors: "None.",
