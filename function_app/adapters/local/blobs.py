@@ -168,10 +168,11 @@ class FileBlobs:
         if time.monotonic() < self._sweep_s:
             return
         self._sweep_s = time.monotonic() + _SWEEP_S
-        for path in self._folder.glob(f"*{_TEMPORARY}"):
-            with contextlib.suppress(OSError):
-                if time.time() - path.stat().st_mtime > _ABANDONED_S:
-                    path.unlink()
+        with contextlib.suppress(FileNotFoundError), os.scandir(self._folder) as entries:
+            for entry in entries:
+                with contextlib.suppress(OSError):
+                    if entry.name.endswith(_TEMPORARY) and time.time() - entry.stat().st_mtime > _ABANDONED_S:
+                        Path(entry).unlink()
 
     async def _write(self, path: Path, content: AsyncIterator[bytes], max_length: int) -> int:
         """Write at most ``max_length`` bytes of the content; returns the number of received bytes."""
