@@ -1,4 +1,8 @@
-"""Blobs as files. Names are encoded as valid file names, so that no blob is outside the folder."""
+"""Blobs as files. Names are encoded as valid file names, so that no blob is outside the folder.
+
+Paths are strings: ``pathlib`` enters each part of a path in Python's table of interned strings, and removes it later.
+A server with new names all the time thus fills and enlarges this table, by 1 MB after 40 minutes.
+"""
 
 import asyncio
 import base64
@@ -57,7 +61,7 @@ class FileBlobs:
         ``receive`` ends an upload when ``is_full`` returns true.
         """
         self._is_full = is_full
-        self._folder = folder
+        self._folder = os.fspath(folder)
         random_keys = (secrets.token_bytes(32),)
         self._keys = keys or (lambda: random_keys)
         self._url = url
@@ -88,7 +92,7 @@ class FileBlobs:
     async def size(self, name: str) -> int | None:
         path = self._path(name)
         try:
-            return (await asyncio.to_thread(path.stat)).st_size
+            return (await asyncio.to_thread(os.stat, path)).st_size
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -116,7 +120,7 @@ class FileBlobs:
         path = self._path(claims["sub"])
         await asyncio.to_thread(self._prepare_upload, path)
         await asyncio.to_thread(self._delete_abandoned)
-        temporary = self._folder / f"{secrets.token_hex(8)}{_TEMPORARY}"
+        temporary = self._temporary()
         try:
             if await self._write(temporary, content, length) != length:
                 raise TransferRefused(400, f"The body must have {length} bytes.")
@@ -127,13 +131,13 @@ class FileBlobs:
             raise _unusable(path, error) from error
         finally:
             with contextlib.suppress(OSError):
-                await asyncio.to_thread(temporary.unlink)
+                await asyncio.to_thread(os.unlink, temporary)
 
     async def send(self, token: str) -> Download:
         claims = self._claims(token, _DOWNLOAD)
         path = self._path(claims["sub"])
         try:
-            file = await asyncio.to_thread(path.open, "rb")
+            file = await asyncio.to_thread(open, path, "rb")
         except FileNotFoundError as error:
             raise TransferRefused(404, "The blob does not exist.") from error
         except OSError as error:
@@ -158,10 +162,10 @@ class FileBlobs:
         raise TransferRefused(403, "The URL is invalid or expired. Request a new one.") from cause
 
     @staticmethod
-    def _prepare_upload(path: Path) -> None:
-        if path.exists():
+    def _prepare_upload(path: str) -> None:
+        if os.path.lexists(path):
             raise _exists_already()
-        path.parent.mkdir(parents=True, exist_ok=True)
+        os.makedirs(os.path.dirname(path), exist_ok=True)
 
     def _delete_abandoned(self) -> None:
         """Delete temporary files of interrupted uploads, at most once an hour: it reads the names of all blobs."""
@@ -172,12 +176,12 @@ class FileBlobs:
             for entry in entries:
                 with contextlib.suppress(OSError):
                     if entry.name.endswith(_TEMPORARY) and time.time() - entry.stat().st_mtime > _ABANDONED_S:
-                        Path(entry).unlink()
+                        os.unlink(entry)
 
-    async def _write(self, path: Path, content: AsyncIterator[bytes], max_length: int) -> int:
+    async def _write(self, path: str, content: AsyncIterator[bytes], max_length: int) -> int:
         """Write at most ``max_length`` bytes of the content; returns the number of received bytes."""
         length = 0
-        with await asyncio.to_thread(path.open, "xb") as file:
+        with await asyncio.to_thread(open, path, "xb") as file:
             async for part in content:
                 length += len(part)
                 if length > max_length:
@@ -191,35 +195,39 @@ class FileBlobs:
     async def close(self) -> None:
         """See ``Blobs``."""
 
-    def _path(self, name: str) -> Path:
-        return self._folder / _relative_path(name)
+    def _path(self, name: str) -> str:
+        return os.path.join(self._folder, _relative_path(name))
 
-    def _put(self, path: Path, content: bytes) -> None:
-        temporary = self._folder / f"{secrets.token_hex(8)}{_TEMPORARY}"
+    def _temporary(self) -> str:
+        return os.path.join(self._folder, f"{secrets.token_hex(8)}{_TEMPORARY}")
+
+    def _put(self, path: str, content: bytes) -> None:
+        temporary = self._temporary()
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with temporary.open("xb") as file:
+            os.makedirs(os.path.dirname(path), exist_ok=True)
+            with open(temporary, "xb") as file:
                 file.write(content)
                 _flush(file)
-            temporary.replace(path)
+            os.replace(temporary, path)
         except OSError as error:
             with contextlib.suppress(OSError):
-                temporary.unlink()
+                os.unlink(temporary)
             raise _unusable(path, error) from error
 
     @staticmethod
-    def _get(path: Path) -> bytes | None:
+    def _get(path: str) -> bytes | None:
         try:
-            return path.read_bytes()
+            with open(path, "rb") as file:
+                return file.read()
         except FileNotFoundError:
             return None
         except OSError as error:
             raise _unusable(path, error) from error
 
     @staticmethod
-    def _append(path: Path, content: bytes) -> None:
+    def _append(path: str, content: bytes) -> None:
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            os.makedirs(os.path.dirname(path), exist_ok=True)
             descriptor = os.open(path, os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o600)
             try:
                 check_size(os.fstat(descriptor).st_size + len(content))
@@ -232,9 +240,11 @@ class FileBlobs:
             raise _unusable(path, error) from error
 
     @staticmethod
-    def _delete(path: Path) -> None:
+    def _delete(path: str) -> None:
         try:
-            path.unlink(missing_ok=True)
+            os.unlink(path)
+        except FileNotFoundError:
+            pass
         except OSError as error:
             raise _unusable(path, error) from error
 
@@ -245,7 +255,7 @@ class FileBlobs:
         return tuple(sorted(names)[:limit])
 
 
-def _names(folder: str | Path, parents: str, prefix: str) -> Iterator[str]:
+def _names(folder: str, parents: str, prefix: str) -> Iterator[str]:
     """The encoded names below a folder that begin with ``prefix``; the folder's own encoded name is ``parents``.
 
     Opens only folders of such names, and keeps one entry at a time. ``Path.rglob`` keeps all paths until its end.
@@ -283,12 +293,12 @@ def _exists_already() -> TransferRefused:
 
 
 @functools.lru_cache(maxsize=256)
-def _relative_path(name: str) -> Path:
+def _relative_path(name: str) -> str:
     """Where a blob is stored. Cached because an upload, its checks and its first reads use the same name."""
     check_name(name)
     encoded = _encode(name)
     parts = [encoded[start : start + _PART] for start in range(0, len(encoded), _PART)]
-    return Path(*(part + _FOLDER for part in parts[:-1]), parts[-1] + _SUFFIX)
+    return os.path.join(*(part + _FOLDER for part in parts[:-1]), parts[-1] + _SUFFIX)
 
 
 def _encode(name: str) -> str:
@@ -310,5 +320,5 @@ def _decode(encoded: str) -> str:
     return base64.urlsafe_b64decode(compact + "=" * (-len(compact) % 4)).decode()
 
 
-def _unusable(path: str | Path, error: OSError) -> StoreError:
+def _unusable(path: str, error: OSError) -> StoreError:
     return StoreError(f"the blob {path} cannot be used: {error.strerror}. Check disk space and permissions.")

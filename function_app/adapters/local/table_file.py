@@ -141,17 +141,20 @@ def keep_log(path: Path) -> str:
     copy = path.with_name(f"{path.name}.damaged-log-{time.time_ns() // 1_000_000}")
     shutil.copyfile(log_of(path), copy)
     copy.chmod(0o600)
-    return _lost_log(copy)
+    return _lost_log(copy.name)
 
 
 def kept_files(path: Path) -> list[str]:
     """A report of each file that was kept because data were lost."""
-    return [_lost_log(file) for file in sorted(path.parent.glob(f"{path.name}.damaged-log-*"))]
+    prefix = f"{path.name}.damaged-log-"
+    with contextlib.suppress(FileNotFoundError), os.scandir(path.parent) as entries:
+        return [_lost_log(name) for name in sorted(entry.name for entry in entries) if name.startswith(prefix)]
+    return []
 
 
-def _lost_log(copy: Path) -> str:
+def _lost_log(name: str) -> str:
     return (
-        f"the log of the tables ended with writes that cannot be read; it is kept as {copy.name}. They were lost, or a "
+        f"the log of the tables ended with writes that cannot be read; it is kept as {name}. They were lost, or a "
         "process was killed during its last write. Check recent changes of accounts and shares, or restore a backup; "
         "then delete this file."
     )

@@ -2,8 +2,10 @@
 
 import asyncio
 import base64
+import builtins
 import os
 import socket
+import sys
 import time
 import tracemalloc
 from collections.abc import AsyncIterator, Awaitable
@@ -127,18 +129,37 @@ async def test_a_list_does_not_keep_the_names_of_other_blobs(blobs: Blobs, tmp_p
     assert peak_bytes < 300_000
 
 
+async def test_names_are_not_interned(blobs: Blobs, monkeypatch: pytest.MonkeyPatch) -> None:
+    """New names all the time would enlarge Python's table of interned strings."""
+    interned: list[str] = []
+    original = sys.intern
+
+    def intern(text: str) -> str:
+        interned.append(text)
+        return original(text)
+
+    monkeypatch.setattr(sys, "intern", intern)
+    await blobs.put("a/b", b"x")
+    await blobs.append("a/c", b"x")
+    assert await blobs.get("a/b") == b"x"
+    assert await blobs.size("a/c") == 1
+    assert await blobs.list("a/") == ("a/b", "a/c")
+    await blobs.delete("a/b")
+    assert interned == []
+
+
 async def test_a_cancelled_download_closes_the_file(blobs: FileBlobs, monkeypatch: pytest.MonkeyPatch) -> None:
     """As the framework cancels it when the client closes the connection: each further wait is cancelled, too."""
     await blobs.put("a", bytes(3_000_000))
     url = await blobs.presign_download("a", content_type="image/png", lifetime_s=60)
     files: list[IO[Any]] = []
-    original = Path.open
+    original = builtins.open
 
     def opened(*arguments: Any) -> IO[Any]:
         files.append(original(*arguments))
         return files[-1]
 
-    monkeypatch.setattr(Path, "open", opened)
+    monkeypatch.setattr(builtins, "open", opened)
     download = await blobs.send(url.rpartition("/")[2])
     with anyio.CancelScope() as scope:
         async for _ in download.content:
