@@ -44,7 +44,8 @@ _NOTIFY_S = 0.5
 _RETRY_S = 5.0
 _SWITCH_INTERVAL_S = 0.001
 _M_ARENA_MAX, _HEAPS = -8, 2
-"""Parameter of ``mallopt`` in ``malloc.h``, and its value."""
+_M_MMAP_THRESHOLD, _LARGE_BYTES = -3, 256 * 1024
+"""Parameters of ``mallopt`` in ``malloc.h``, and their values."""
 _log = logging.getLogger(__name__)
 
 
@@ -223,14 +224,17 @@ def _force_exit_later() -> None:
 
 
 def _limit_heaps() -> None:
-    """Use two heaps for all threads.
+    """Use two heaps for all threads, and return the memory of large blocks as soon as they are free.
 
     The GNU C library makes up to eight for each processor, and free memory of one cannot be used by the threads of
-    another. The agent of five devices has seventy threads.
+    another. The agent of five devices has seventy threads. The library also takes large blocks, such as pictures, from
+    a heap once it has freed a larger one, and keeps their memory: 155 MB instead of 149 after ten minutes.
     """
     if sys.platform == "linux":
         with contextlib.suppress(AttributeError):  # another C library
-            ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _HEAPS)
+            library = ctypes.CDLL(None)
+            library.mallopt(_M_ARENA_MAX, _HEAPS)
+            library.mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
 
 
 def _prioritize_control_loops() -> None:

@@ -96,3 +96,27 @@ def test_threads_share_two_heaps(limit: str, few: bool) -> None:
     program = [sys.executable, "-c", _ALLOCATE.format(limit=limit)]
     shown = subprocess.run(program, capture_output=True, text=True, check=True).stderr
     assert (shown.count("Arena ") <= 2) is few
+
+
+_ALLOCATE_LARGE = """
+import ctypes, re
+from device_agent.cli import run
+
+{limit}
+library = ctypes.CDLL(None)
+library.malloc.argtypes, library.malloc.restype = [ctypes.c_size_t], ctypes.c_void_p
+library.free.argtypes = [ctypes.c_void_p]
+library.free(library.malloc(4_000_000))
+address = library.malloc(1_000_000)
+with open("/proc/self/maps") as maps:
+    first, last = re.search(r"^(\\w+)-(\\w+) .*\\[heap\\]$", maps.read(), re.MULTILINE).groups()
+print(int(first, 16) <= address < int(last, 16))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the GNU C library")
+@pytest.mark.parametrize(("limit", "in_heap"), [("run._limit_heaps()", False), ("", True)])
+def test_large_blocks_are_not_in_a_heap(limit: str, in_heap: bool) -> None:
+    program = [sys.executable, "-c", _ALLOCATE_LARGE.format(limit=limit)]
+    shown = subprocess.run(program, capture_output=True, text=True, check=True).stdout
+    assert shown == f"{in_heap}\n"
