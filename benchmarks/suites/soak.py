@@ -87,10 +87,9 @@ The broker grew by 0.02 MB per minute, also after half an hour, so revocations a
 did not grow by 22,000 messages, and by 0.1 to 0.4 kB for each connection. Before the run of 99 minutes (2026-11-29,
 counted after 50 minutes; 19,923 requests, 2,424 actions, no errors, no additional descriptors), each read of an audit
 log kept the paths of all stored blobs, 0.85 kB each, and each closed connection of the broker waited for garbage
-collection. Only a few short tests
-ran beside this run, in its first 20 minutes. Functions, worker and broker reach the limit. The functions made two steps
-of 1.0 and 1.3 MB after 40 and 60 minutes, and did not grow after 70. The agent grew in steps that became smaller: 1.0,
-0.6, 0.8, 0.2 and 0.2 MB after 22, 53, 63, 76 and 87 minutes.""",
+collection. Only a few short tests ran beside this run, in its first 20 minutes. Functions, worker and broker reach the
+limit. The functions made two steps of 1.0 and 1.3 MB after 40 and 60 minutes, and did not grow after 70. The agent grew
+in steps that became smaller: 1.0, 0.6, 0.8, 0.2 and 0.2 MB after 22, 53, 63, 76 and 87 minutes.""",
 )
 
 

@@ -62,7 +62,7 @@ def add_commands(commands: Commands, home: Path) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    _limit_heaps()
+    _configure_allocator()
     store = IdentityStore(options.home)
     with store.lock():
         trial = Trial.of(store.folder, os.environ)
@@ -223,12 +223,12 @@ def _force_exit_later() -> None:
     timer.start()
 
 
-def _limit_heaps() -> None:
+def _configure_allocator() -> None:
     """Use two heaps for all threads, and return the memory of large blocks as soon as they are free.
 
     The GNU C library makes up to eight for each processor, and free memory of one cannot be used by the threads of
     another. The agent of five devices has seventy threads. The library also takes large blocks, such as pictures, from
-    a heap once it has freed a larger one, and keeps their memory: 155 MB instead of 149 after ten minutes.
+    a heap once it has freed a larger one, and keeps their memory: in the laboratory 155 MB instead of 149.
     """
     if sys.platform == "linux":
         with contextlib.suppress(AttributeError):  # another C library

@@ -1,7 +1,7 @@
 """Blobs as files. Names are encoded as valid file names, so that no blob is outside the folder.
 
 Paths are strings: ``pathlib`` enters each part of a path in Python's table of interned strings, and removes it later.
-A server with new names all the time thus fills and enlarges this table, by 1 MB after 40 minutes.
+A server with new names all the time thus fills and enlarges this table: in the laboratory by 1 MB after 40 minutes.
 """
 
 import asyncio
@@ -163,7 +163,7 @@ class FileBlobs:
 
     @staticmethod
     def _prepare_upload(path: str) -> None:
-        if os.path.lexists(path):
+        if os.path.exists(path):
             raise _exists_already()
         os.makedirs(os.path.dirname(path), exist_ok=True)
 
@@ -250,15 +250,19 @@ class FileBlobs:
 
     def _list(self, prefix: str, limit: int) -> tuple[str, ...]:
         # A readable name begins with its encoded prefix. A compact one must be decoded.
-        found = {*_names(self._folder, "", _percent_encoded(prefix)), *_names(self._folder, "", _COMPACT)}
+        found = _names(self._folder, "", (_percent_encoded(prefix), _COMPACT))
         names = [name for name in map(_decode, found) if name.startswith(prefix)]
         return tuple(sorted(names)[:limit])
 
 
-def _names(folder: str, parents: str, prefix: str) -> Iterator[str]:
-    """The encoded names below a folder that begin with ``prefix``; the folder's own encoded name is ``parents``.
+def _names(folder: str, parents: str, prefixes: tuple[str, ...]) -> Iterator[str]:
+    """The encoded names of the blobs below a folder that begin with one of the prefixes.
 
-    Opens only folders of such names, and keeps one entry at a time. ``Path.rglob`` keeps all paths until its end.
+    ``parents`` is the part of these names that the folder and its parents stand for. Opens only folders of such names,
+    and keeps one entry at a time: ``Path.rglob`` keeps all paths until its end.
+
+    Raises:
+        StoreError: The folder cannot be read. One that does not exist has no blobs.
     """
     try:
         entries = os.scandir(folder)
@@ -270,10 +274,10 @@ def _names(folder: str, parents: str, prefix: str) -> Iterator[str]:
         for entry in entries:
             name = parents + entry.name.removesuffix(_SUFFIX).removesuffix(_FOLDER)
             if entry.name.endswith(_SUFFIX):
-                if name.startswith(prefix):
+                if name.startswith(prefixes):
                     yield name
-            elif entry.name.endswith(_FOLDER) and name.startswith(prefix[: len(name)]):
-                yield from _names(entry.path, name, prefix)
+            elif entry.name.endswith(_FOLDER) and name.startswith(tuple(prefix[: len(name)] for prefix in prefixes)):
+                yield from _names(entry.path, name, prefixes)
 
 
 async def _parts(file: BinaryIO) -> AsyncGenerator[bytes, None]:

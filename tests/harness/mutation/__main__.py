@@ -26,6 +26,8 @@ def main() -> int:
         help="continue the previous run: test only mutants of changed files, untested ones, and those that survived",
     )
     arguments = parser.parse_args()
+    if arguments.page and arguments.packages:
+        parser.error("--page needs the results of all packages")
     os.chdir(ROOT)
     names = mutants.generate(resume=arguments.resume)
     sample = {

@@ -75,7 +75,7 @@ _ALLOCATE = """
 import ctypes, threading
 from device_agent.cli import run
 
-{limit}
+{configure}
 library = ctypes.CDLL(None)
 barrier = threading.Barrier(6)
 
@@ -91,9 +91,9 @@ library.malloc_stats()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the GNU C library")
-@pytest.mark.parametrize(("limit", "few"), [("run._limit_heaps()", True), ("", False)])
-def test_threads_share_two_heaps(limit: str, few: bool) -> None:
-    program = [sys.executable, "-c", _ALLOCATE.format(limit=limit)]
+@pytest.mark.parametrize(("configure", "few"), [("run._configure_allocator()", True), ("", False)])
+def test_threads_share_two_heaps(configure: str, few: bool) -> None:
+    program = [sys.executable, "-c", _ALLOCATE.format(configure=configure)]
     shown = subprocess.run(program, capture_output=True, text=True, check=True).stderr
     assert (shown.count("Arena ") <= 2) is few
 
@@ -102,7 +102,7 @@ _ALLOCATE_LARGE = """
 import ctypes, re
 from device_agent.cli import run
 
-{limit}
+{configure}
 library = ctypes.CDLL(None)
 library.malloc.argtypes, library.malloc.restype = [ctypes.c_size_t], ctypes.c_void_p
 library.free.argtypes = [ctypes.c_void_p]
@@ -115,8 +115,8 @@ print(int(first, 16) <= address < int(last, 16))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the GNU C library")
-@pytest.mark.parametrize(("limit", "in_heap"), [("run._limit_heaps()", False), ("", True)])
-def test_large_blocks_are_not_in_a_heap(limit: str, in_heap: bool) -> None:
-    program = [sys.executable, "-c", _ALLOCATE_LARGE.format(limit=limit)]
+@pytest.mark.parametrize(("configure", "in_heap"), [("run._configure_allocator()", False), ("", True)])
+def test_large_blocks_are_not_in_a_heap(configure: str, in_heap: bool) -> None:
+    program = [sys.executable, "-c", _ALLOCATE_LARGE.format(configure=configure)]
     shown = subprocess.run(program, capture_output=True, text=True, check=True).stdout
     assert shown == f"{in_heap}\n"
