@@ -8,13 +8,13 @@ import math
 import zlib
 from array import array
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 WINDOW_MS = 10_000
-MAX_VALUES = 16_000
-"""Maximum number of values in a window, so that a row stays below 256 KB even if incompressible."""
+MAX_VALUES = 22_000
+"""Maximum number of values and times in a window, so that a row stays below 256 KB even if incompressible."""
 MAX_FIELDS = 256
 """Maximum number of fields of a sample."""
 MAX_MAGNITUDE = 1e300
@@ -59,6 +59,15 @@ class Samples:
         """Samples from index ``start`` up to, but not including, ``end``."""
         return Samples(self.at_ms[start:end], {name: values[start:end] for name, values in self.columns.items()})
 
+    def chosen(self, indices: Sequence[int]) -> "Samples":
+        """Samples with these indices, in ascending order."""
+        if len(indices) == len(self):
+            return self
+        return Samples(
+            array("q", [self.at_ms[index] for index in indices]),
+            {name: array("d", [values[index] for index in indices]) for name, values in self.columns.items()},
+        )
+
     def between(self, first_ms: int, last_ms: int) -> "Samples":
         """Samples with ``first_ms`` ≤ time < ``last_ms``."""
         return self.part(bisect_left(self.at_ms, first_ms), bisect_left(self.at_ms, last_ms))
@@ -89,13 +98,7 @@ def new_samples(samples: Samples, existing: Samples) -> Samples:
     if not existing.at_ms or not samples.at_ms or samples.at_ms[0] > existing.at_ms[-1]:
         return samples
     times = set(existing.at_ms)
-    chosen = [index for index, at_ms in enumerate(samples.at_ms) if at_ms not in times]
-    if len(chosen) == len(samples):
-        return samples
-    return Samples(
-        array("q", [samples.at_ms[index] for index in chosen]),
-        {name: array("d", [values[index] for index in chosen]) for name, values in samples.columns.items()},
-    )
+    return samples.chosen([index for index, at_ms in enumerate(samples.at_ms) if at_ms not in times])
 
 
 def merge(one: Samples, other: Samples) -> Samples:
@@ -116,10 +119,20 @@ def merge(one: Samples, other: Samples) -> Samples:
 
 
 def fit_window(samples: Samples, existing: Samples) -> Samples:
-    """The samples that still fit into their window."""
-    names = len({*samples.columns, *existing.columns}) or 1
-    left = max(0, MAX_VALUES // names - len(existing))
-    return samples if len(samples) <= left else samples.part(0, left)
+    """The samples to store of those of one window, so that all of the window is covered.
+
+    A tenth of what a window may contain is free for any time. The rest becomes available evenly over the window, so
+    samples at a higher rate are thinned out instead of cut off.
+    """
+    most = MAX_VALUES // (len({*samples.columns, *existing.columns}) + 1)
+    burst = most // 10
+    chosen: list[int] = []
+    for index, at_ms in enumerate(samples.at_ms):
+        allowed = burst + math.ceil((most - burst) * (at_ms % WINDOW_MS + 1) / WINDOW_MS)
+        before = bisect_left(existing.at_ms, at_ms) + len(chosen)
+        if before < allowed and len(existing) + len(chosen) < most:
+            chosen.append(index)
+    return samples.chosen(chosen)
 
 
 # ---------------------------------------------------------------- rows

@@ -42,6 +42,10 @@ class Place(NamedTuple):
     pairing: str
     stream: str
 
+    def __str__(self) -> str:
+        """For log lines, which operators read on the administration page."""
+        return f"{self.stream} of {self.device}"
+
     @property
     def streams(self) -> str:
         """Partition that lists the streams of the device."""
@@ -94,8 +98,8 @@ class SeriesWriter:
     async def add(self, place: Place, samples: Samples) -> Samples:
         """Add new samples; return those that were new.
 
-        Samples that are too old, more than five minutes ahead, or beyond the size of their window are dropped and
-        logged.
+        Samples that are too old or more than five minutes ahead are dropped and logged. Those of a stream with many
+        fields are stored at the highest rate at which a window fits into a row; see ``series.fit_window``.
 
         Raises:
             Problem: ``busy``: some samples may be written. Retry.
@@ -157,8 +161,6 @@ class SeriesWriter:
             stored = series.unpack(row.data) if row else Samples()
             created = series.new_samples(_only(window, names), stored)
             fitting = series.fit_window(created, stored)
-            if len(fitting) < len(created):
-                _log.warning("%s: %d samples are more than a window holds", place, len(created) - len(fitting))
             if not fitting:
                 continue
             new = series.merge(new, fitting)
