@@ -12,6 +12,8 @@ export const PERIOD_S = 0.01;
 
 interface Row {
   time_s: number;
+  /** Number of the control period; by default that of a robot that is never late. */
+  sequence?: number;
   source?: string;
   position_rad?: (number | null)[];
   requested_rad?: number[];
@@ -65,9 +67,9 @@ export async function writeSegment({ segment = 0, rows = [], events = [], images
   return output.content();
 }
 
-function controlRow({ time_s, source = "operator", position_rad = [time_s, -time_s], requested_rad = [9, 9], seen_tick_ms = 0, limited = [] }: Row): object {
+function controlRow({ time_s, sequence = Math.round(time_s / PERIOD_S), source = "operator", position_rad = [time_s, -time_s], requested_rad = [9, 9], seen_tick_ms = 0, limited = [] }: Row): object {
   return {
-    tick_ns: STARTED_TICK_NS + Math.round(time_s * 1e9), at_ms: 0, sequence: Math.round(time_s / PERIOD_S), epoch: EPOCH, mode: "streaming", source,
+    tick_ns: STARTED_TICK_NS + Math.round(time_s * 1e9), at_ms: 0, sequence, epoch: EPOCH, mode: "streaming", source,
     position_rad, velocity_rad_s: [0, 0], effort_nm: [0, 0], requested_rad, commanded_rad: [8, 8], applied_rad: [7, 7],
     twist: [0, 0, 0], setpoint_sequence: 3, seen_tick_ms, loop_age_ms: 40, limited,
   };

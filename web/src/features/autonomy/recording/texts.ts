@@ -153,7 +153,7 @@ export const texts = {
     exists: "A movement with this name exists. Choose another name.",
     description: (label: string, by: string): string => `${label === "" ? "Recorded session" : label}: ${by}`,
     errors: {
-      gap: "This part has a time without data. Choose an episode without a gap.",
+      gap: "Data is missing in this part. Choose an episode without missing data.",
       base: "The base moved in this part. Only the joints can be replayed: choose an episode without driving.",
       empty: "This part has no rows.",
       "too-long": "This part is too long for one movement: at most ten minutes, and shorter if the motion is fast. Choose a shorter episode.",

@@ -1,7 +1,7 @@
 import { describe, expect, it } from "vitest";
 import { type AppliedSample, appliedBetween, replayScript } from "../../../../src/features/autonomy/model/recording/replay-script";
 import { decodeSegment } from "../../../../src/features/autonomy/model/recording/decode-segment";
-import { rowsFrom, writeSegment } from "../../../support/recordings";
+import { PERIOD_S, rowsFrom, writeSegment } from "../../../support/recordings";
 
 const JOINTS = ["shoulder", "elbow"];
 const samples = (count: number, at: (time: number) => number[]): AppliedSample[] =>
@@ -92,7 +92,19 @@ describe("the applied positions of a part", () => {
     expect([times[0], times.at(-1)]).toEqual([59.5, 60.5]);
   });
 
-  it("are rejected with a gap, and without rows", async () => {
+  it("remain the last ones while the agent is late", async () => {
+    const rows = [...rowsFrom(0, 1), ...rowsFrom(1.5, 2).map((row, index) => ({ ...row, sequence: 100 + index }))];
+    const segment = await decodeSegment(await writeSegment({ rows }));
+    segment.applied_rad = Float64Array.from([...segment.time_s].flatMap((time) => [time, -time]));
+    const applied = appliedBetween([segment], 0, 2);
+    const found = "samples" in applied ? applied.samples : [];
+    expect(found).toHaveLength(rows.length + 1);
+    expect(found[100]?.time_s).toBeCloseTo(1.5 - PERIOD_S, 6);
+    expect(found[100]?.position_rad).toEqual(found[99]?.position_rad);
+    expect(found[101]?.position_rad[0]).toBeCloseTo(1.5, 6);
+  });
+
+  it("are rejected with missing rows, and without rows", async () => {
     expect(appliedBetween(await segments(), 15, 35)).toEqual({ error: "gap" });
     expect(appliedBetween(await segments(), 21, 29)).toEqual({ error: "empty" });
   });

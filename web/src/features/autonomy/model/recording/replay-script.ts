@@ -1,5 +1,5 @@
 /** Converts a part of a recording to a movement script, which any robot of the type runs with all its limits. */
-import { gapOf, rowOf } from "./samples";
+import { GAP_PERIODS, gapOf, rowOf } from "./samples";
 import type { Segment } from "./segment";
 import { MAX_SCRIPT_LENGTH, simplify } from "../../../keyframes/model";
 
@@ -15,23 +15,32 @@ export interface Replay {
   /** One line for people, such as the session's operator and time. */
   description: string;
   joints: readonly string[];
-  /** In order of time, without a gap. */
+  /** In order of time, without missing rows. */
   samples: readonly AppliedSample[];
 }
 
-/** Why a part of a recording cannot become a movement: it has a gap, or the base moved, or it has no rows. */
+/** Why a part of a recording cannot become a movement: rows are missing, or the base moved, or it has no rows. */
 export type AppliedSamples = { samples: AppliedSample[] } | { error: "gap" | "base" | "empty" };
 
-/** What the driver applied between two times [s] in all rows of `segments`, which are in order of time. */
+/**
+ * What the driver applied between two times [s] in all rows of `segments`, which are in order of time.
+ *
+ * Control periods have consecutive numbers. If time passed and no number is missing, the agent was late and the driver
+ * kept what it had applied last.
+ */
 export function appliedBetween(segments: readonly Segment[], from_s: number, to_s: number): AppliedSamples {
   const samples: AppliedSample[] = [];
+  let lastSequence: number | undefined;
   for (const segment of segments) {
     for (const [index, time_s] of segment.time_s.entries()) {
       if (time_s < from_s || time_s > to_s) continue;
-      const last = samples.at(-1);
-      if (last !== undefined && time_s - last.time_s > gapOf(segment)) return { error: "gap" };
+      const sequence = segment.sequence[index] ?? NaN;
+      if (lastSequence !== undefined && sequence - lastSequence > GAP_PERIODS) return { error: "gap" };
       if (rowOf(segment.twist, 3, index).some((value) => value !== 0)) return { error: "base" };
+      const last = samples.at(-1);
+      if (last !== undefined && time_s - last.time_s > gapOf(segment)) samples.push({ ...last, time_s: time_s - segment.period_s });
       samples.push({ time_s, position_rad: Array.from(rowOf(segment.applied_rad, segment.joints.length, index)) });
+      lastSequence = sequence;
     }
   }
   return samples.length === 0 ? { error: "empty" } : { samples };

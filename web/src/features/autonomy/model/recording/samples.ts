@@ -6,7 +6,7 @@ export type Source = (typeof SOURCES)[number];
 export const MODES = ["idle", "streaming", "action", "holding", "stopped", "fault"] as const satisfies readonly Mode[];
 
 /** A time between two samples that is longer than this many periods is a gap. */
-const GAP_PERIODS = 2.5;
+export const GAP_PERIODS = 2.5;
 
 /** Samples in order of time. Joint values are row by row, in the order of `joints`. */
 export interface Samples {
