@@ -4,7 +4,9 @@ A Functions host imports this package and looks for one ``FunctionApp``; it is c
 access, so that other programs do not pay for the import.
 """
 
+import contextlib
 import gc
+import sys
 from typing import Any
 
 VERSION = "0.1.0"
@@ -14,6 +16,8 @@ _STARTING = 20_000
 thousands of objects that all stay; collecting among them was 7 % of a cold start."""
 _RUNNING = gc.get_threshold()
 """Python's own thresholds. Smaller ones for full collections made an action up to 48 % slower."""
+_M_MMAP_THRESHOLD, _LARGE_BYTES = -3, 128 * 1024
+"""Parameter of ``mallopt`` in ``malloc.h``, and the GNU C library's own initial value."""
 
 gc.set_threshold(_STARTING, *gc.get_threshold()[1:])
 
@@ -22,7 +26,16 @@ def run_for_long() -> None:
     """Exclude all existing objects from garbage collection, and collect the others as often as Python does by default.
 
     With the thresholds of the start, the garbage of requests grew for ten minutes and more, to 4 MB.
+
+    Also return large blocks to the system when they are free. asyncio reads from each socket into a block of 256 kB.
+    The GNU C library takes such blocks from its heap once it has freed one, and what is allocated behind them divides
+    the heap: that of the broker grew by 1.4 MB in 2,400 connections, and does not grow otherwise.
     """
+    import ctypes  # noqa: PLC0415 (functions that start for one request do not need it)
+
+    if sys.platform == "linux":
+        with contextlib.suppress(AttributeError):  # another C library
+            ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
     gc.collect()
     gc.freeze()
     gc.collect()  # a full collection waits until new objects are a quarter of those that the last one left
