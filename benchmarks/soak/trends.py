@@ -30,7 +30,8 @@ class Slope(msgspec.Struct, frozen=True):
 class DescriptorTrend(msgspec.Struct, frozen=True, kw_only=True):
     """Descriptors of one part after warm-up; ``first`` and ``last`` are low percentiles of the first and last samples.
 
-    A running script has its own descriptors. A leak raises the minimum.
+    Only samples with the most frequent number of the agent's children count, because each running script has its own
+    descriptors, also at the agent. A leak raises the minimum.
     """
 
     part: str
@@ -85,19 +86,21 @@ def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: flo
     """Returns the values of each part and their total. ``end_share``: share of samples used at both ends."""
     samples = list(samples)
     samples += totals(samples)
+    comparable = _at_equal_load(each for each in samples if each.at_s >= warm_up_s)
     found = []
     for part in (*PARTS, TOTAL):
         mine = [each for each in samples if each.part == part and each.at_s >= warm_up_s]
         if len(mine) < _MIN_POINTS:
             continue
         at_s = [each.at_s for each in mine]
-        few = max(1, round(len(mine) * end_share))
+        equal = [each for each in mine if each.at_s in comparable]
+        few = max(1, round(len(equal) * end_share))
 
         def ends(values: list[int], few: int = few) -> tuple[float, float]:
             return percentile(values[:few], _LOW_SHARE), percentile(values[-few:], _LOW_SHARE)
 
         rss, own = [each.rss_mb for each in mine], [each.own_mb for each in mine]
-        descriptors, threads = [each.descriptors for each in mine], [each.threads for each in mine]
+        descriptors, threads = [each.descriptors for each in equal], [each.threads for each in equal]
         found.append(
             DescriptorTrend(
                 part=part,
@@ -107,12 +110,21 @@ def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: flo
                 own_mb=percentile(own, 0.5),
                 first_descriptors=ends(descriptors)[0],
                 last_descriptors=ends(descriptors)[1],
-                most_descriptors=max(descriptors),
+                most_descriptors=max(each.descriptors for each in mine),
                 first_threads=ends(threads)[0],
                 last_threads=ends(threads)[1],
             )
         )
     return found
+
+
+def _at_equal_load(samples: Iterable[Sample]) -> set[float]:
+    """Returns the times of the samplings with the most frequent number of the agent's children."""
+    children: dict[float, int] = {}
+    for each in samples:
+        children[each.at_s] = children.get(each.at_s, 0) + (each.processes if each.part == CHILDREN else 0)
+    most_frequent = statistics.mode(children.values()) if children else 0
+    return {at_s for at_s, number in children.items() if number == most_frequent}
 
 
 def totals(samples: Iterable[Sample]) -> list[Sample]:

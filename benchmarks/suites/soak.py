@@ -45,7 +45,8 @@ samples, are in `benchmarks/results/quick`."""
 _NOTE: Final = """Theil-Sen slopes over medians of one minute, after a warm-up of half the run (at most one hour, the
 lifetime of a token and of what is stored about it), with Sen's 95 % interval; a plus sign means growth. Own memory is
 anonymous memory (heap and stack); resident memory includes shared libraries. First and last descriptors and threads
-are the lowest tenth of the first and the last tenth of the run after warm-up, because each running script has its own.
+are the lowest tenth of the first and the last tenth of the run after warm-up, of the samples with the most frequent
+number of the agent's children, because each running script has its own, also at the agent.
 The agent's children are its planner and script sandboxes; their number follows the load."""
 
 _HISTORY: Final = Table(

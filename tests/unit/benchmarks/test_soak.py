@@ -17,10 +17,9 @@ MINUTES = range(50)
 TIMES_S = [60.0 * minute for minute in MINUTES]
 
 
-def sample(at_s: float, *, mb: float = 100.0, descriptors: int = 20, part: str = "agent") -> Sample:
-    return Sample(
-        at_s=at_s, part=part, processes=1, rss_mb=mb + 50, pss_mb=mb, own_mb=mb, descriptors=descriptors, threads=3
-    )
+def sample(at_s: float, *, mb: float = 100.0, descriptors: int = 20, part: str = "agent", processes: int = 1) -> Sample:
+    memory = {"rss_mb": mb + 50, "pss_mb": mb, "own_mb": mb}
+    return Sample(at_s=at_s, part=part, processes=processes, descriptors=descriptors, threads=3, **memory)
 
 
 def test_the_slope_ignores_outliers_and_noise() -> None:
@@ -45,6 +44,18 @@ def test_growth_counts_after_the_warm_up() -> None:
     trends = {each.part: each for each in after_warm_up([*leaking, *warming], 600)}
     assert trends["agent"].more_descriptors > 30
     assert (trends["broker"].more_descriptors, trends["broker"].own.percent_per_h) == (0, 0)
+
+
+@pytest.mark.parametrize("leaked", [0, 1])
+def test_descriptors_of_running_scripts_do_not_count_as_additional(leaked: int) -> None:
+    samples = []
+    for at in range(0, 3600, 5):
+        children = 3 if at % 20 else 2 + at // 2000  # at the end no sample has the fewest children
+        descriptors = 20 + 2 * children + (leaked if at > 1800 else 0)
+        samples.append(sample(float(at), descriptors=descriptors))
+        samples.append(sample(float(at), part=CHILDREN, processes=children))
+    trends = {each.part: each for each in after_warm_up(samples, 0)}
+    assert (trends["agent"].first_descriptors, trends["agent"].more_descriptors) == (26, leaked)
 
 
 def test_permanent_parts_are_also_evaluated_in_total() -> None:
