@@ -23,13 +23,14 @@ gc.set_threshold(_STARTING, *gc.get_threshold()[1:])
 
 
 def run_for_long() -> None:
-    """Exclude all existing objects from garbage collection, and collect the others as often as Python does by default.
+    """Configure garbage collection and the allocator of a program that runs for long.
 
-    With the thresholds of the start, the garbage of requests grew for ten minutes and more, to 4 MB.
+    All existing objects are excluded from garbage collection, and the others are collected as often as Python does by
+    default. With the thresholds of the start, the garbage of requests grew for ten minutes and more, to 4 MB.
 
-    Also return large blocks to the system when they are free. asyncio reads from each socket into a block of 256 kB.
-    The GNU C library takes such blocks from its heap once it has freed one, and what is allocated behind them divides
-    the heap: that of the broker grew by 1.4 MB in 2,400 connections, and does not grow otherwise.
+    Large blocks return to the system when they are free. asyncio reads from each socket into a block of 256 kB. The GNU
+    C library takes such blocks from its heap once it has freed one, and small blocks behind them fragment the heap:
+    that of the broker grew by 1.4 MB in 2,400 connections, and does not grow with this setting.
     """
     import ctypes  # noqa: PLC0415 (functions that start for one request do not need it)
 

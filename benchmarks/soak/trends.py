@@ -93,7 +93,7 @@ def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: flo
         if len(mine) < _MIN_POINTS:
             continue
         at_s = [each.at_s for each in mine]
-        equal = [each for each in mine if each.at_s in comparable]
+        equal = [each for each in mine if each.at_s in comparable] or mine  # most often there may be no children
         few = max(1, round(len(equal) * end_share))
 
         def ends(values: list[int], few: int = few) -> tuple[float, float]:

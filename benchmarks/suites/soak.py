@@ -32,7 +32,7 @@ _FULL_S: Final = 3600.0
 """Shortest run whose result is published."""
 _WARM_UP: Final = 1 / 2
 _MAX_WARM_UP_S: Final = 3600.0
-"""Warm-up: this share of the run, at most this time. Tokens, and what is stored about them, last one hour."""
+"""Warm-up: this share of the run, at most this time. Tokens last one hour; revocations of a client are stored longer."""
 _LOG_ERROR: Final = re.compile(r"^(?:[-0-9]+ [:,0-9]+ )?((?:ERROR|CRITICAL)\b.*|Traceback .*)", re.MULTILINE)
 _PRESSURE: Final = "cpu.pressure"
 _ABOUT: Final = """The laboratory as `make up` starts it with {broker}: four robots and a room behind one agent. One
@@ -43,7 +43,7 @@ robot with another account, reads all lists and removes the share. `make soak` r
 `SOAK_BROKER` set another duration and broker. Ctrl-C ends a run with its report. Results of less than an hour, and all
 samples, are in `benchmarks/results/quick`."""
 _NOTE: Final = """Theil-Sen slopes over medians of one minute, after a warm-up of half the run (at most one hour, the
-lifetime of a token and of what is stored about it), with Sen's 95 % interval; a plus sign means growth. Own memory is
+lifetime of a token), with Sen's 95 % interval; a plus sign means growth. Own memory is
 anonymous memory (heap and stack); resident memory includes shared libraries. First and last descriptors and threads
 are the lowest tenth of the first and the last tenth of the run after warm-up, of the samples with the most frequent
 number of the agent's children, because each running script has its own, also at the agent.
@@ -93,11 +93,11 @@ collection. Only a few short tests ran beside this run, in its first 20 minutes.
 limit. The functions made two steps of 1.0 and 1.3 MB after 40 and 60 minutes, and did not grow after 70. The agent grew
 in steps that became smaller: 1.0, 0.6, 0.8, 0.2 and 0.2 MB after 22, 53, 63, 76 and 87 minutes. In the run of
 120 minutes (2026-11-29, counted after one hour; 23,753 requests, 2,910 actions, no errors; mutation testing with idle
-priority ran beside its first 55 minutes), all programs but the broker reach the limit. It grew by 0.01 MB per minute
-after 85 minutes. Its heap was divided: asyncio reads into blocks of 256 kB, and the GNU C library takes them from the
-heap, with small blocks behind them. With 25,000 messages a second and 30 new connections a second, the heap grew by
-1.4 MB in 2,400 connections, of which nothing was in use. The server's programs return large blocks since then, and the
-same load does not increase the heap.""",
+priority ran beside its first 55 minutes), all programs but the broker reach the limit. The broker grew by 0.01 MB per
+minute after 85 minutes, because its heap was fragmented: asyncio reads into blocks of 256 kB, which the GNU C library
+takes from the heap, with small blocks behind them. With 25,000 messages a second and 30 new connections a second, the
+heap grew by 1.4 MB in 2,400 connections, of which nothing was in use. The server's programs return large blocks since
+then, and the same load does not increase the heap.""",
 )
 
 

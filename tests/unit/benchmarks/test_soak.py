@@ -58,6 +58,13 @@ def test_descriptors_of_running_scripts_do_not_count_as_additional(leaked: int) 
     assert (trends["agent"].first_descriptors, trends["agent"].more_descriptors) == (26, leaked)
 
 
+def test_parts_without_samples_at_the_most_frequent_load_count_with_all_of_theirs() -> None:
+    samples = [sample(float(at)) for at in range(0, 3600, 5)]
+    samples += [sample(float(at), part=CHILDREN, descriptors=5) for at in range(0, 3600, 60)]
+    trends = {each.part: each for each in after_warm_up(samples, 0)}
+    assert (trends[CHILDREN].first_descriptors, trends["agent"].first_descriptors) == (5, 20)
+
+
 def test_permanent_parts_are_also_evaluated_in_total() -> None:
     series = {"agent": 100.0, "broker": 20.0, CHILDREN: 50.0}
     samples = [sample(float(at), part=part, mb=mb) for at in range(0, 600, 5) for part, mb in series.items()]

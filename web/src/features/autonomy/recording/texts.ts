@@ -141,7 +141,7 @@ export const texts = {
 
   movement: {
     title: "Replay on a robot",
-    explained: "Saves the applied positions of the episode at the cursor, or of the whole session, as a movement. It first moves to the start on a planned path. All limits of the robot apply.",
+    explained: "Saves the applied positions of the episode at the cursor, or of the whole session, as a movement. It first moves to the start on a planned path. All limits of the robot apply. While the agent was late, the last position is kept.",
     part: (name: string, start: number, end: number): string => `${name}, ${clock(start)} – ${clock(end)}`,
     session: "Whole session",
     name: "Name of the movement",

@@ -34,7 +34,7 @@ export function appliedBetween(segments: readonly Segment[], from_s: number, to_
   for (const segment of segments) {
     for (const [index, time_s] of segment.time_s.entries()) {
       if (time_s < from_s || time_s > to_s) continue;
-      const sequence = segment.sequence[index] ?? NaN;
+      const sequence = segment.sequence[index] ?? Infinity;
       if (lastSequence !== undefined && sequence - lastSequence > GAP_PERIODS) return { error: "gap" };
       if (rowOf(segment.twist, 3, index).some((value) => value !== 0)) return { error: "base" };
       const last = samples.at(-1);
