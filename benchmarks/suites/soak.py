@@ -32,7 +32,7 @@ _FULL_S: Final = 3600.0
 """Shortest run whose result is published."""
 _WARM_UP: Final = 1 / 2
 _MAX_WARM_UP_S: Final = 3600.0
-"""Warm-up: this share of the run, at most this time. Tokens last one hour; revocations of a client are stored longer."""
+"""Warm-up: this share of the run, at most this time. A token lasts one hour, the revocation of a client two."""
 _LOG_ERROR: Final = re.compile(r"^(?:[-0-9]+ [:,0-9]+ )?((?:ERROR|CRITICAL)\b.*|Traceback .*)", re.MULTILINE)
 _PRESSURE: Final = "cpu.pressure"
 _ABOUT: Final = """The laboratory as `make up` starts it with {broker}: four robots and a room behind one agent. One
