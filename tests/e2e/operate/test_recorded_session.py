@@ -70,6 +70,8 @@ def test_a_time_without_data_is_shown_as_such(browser: Browser, machine: Machine
 def test_two_sessions_are_compared(browser: Browser, machine: Machine) -> None:
     other = record_session(1, epoch=EPOCH + 1, delay_ms=500)
     with opened(browser, machine, record_session(2), other) as page:
+        expect(page.get_by_test_id("compare-session")).to_be_enabled()
+        assert_good_page(page, "session-choice")  # the names of sessions are wider than a phone
         page.get_by_test_id("compare-session").select_option(str(other.epoch))
         expect(page.get_by_test_id("compare-joints").locator("tbody tr")).to_have_count(6)
         expect(page.get_by_test_id("compare-figures").locator("[data-row=recorded]")).to_contain_text("2:00.01:00.0")
