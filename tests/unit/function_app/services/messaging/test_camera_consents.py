@@ -89,6 +89,7 @@ def test_the_owners_decision_is_signed_numbered_and_recorded(site: Site) -> None
     command = site.robot.received(SetCameraConsent)[0]
     assert isinstance(command.request, SetCameraConsent)
     assert (command.caller, command.request.account) == ("anna", site.anna.account)
+    assert command.epoch == 0, "consent is not control"
     entries = [each for each in site.anna.pages("/accounts/me/audit") if each["event"] == "camera-consent-set"]
     assert [(each["outcome"], each["target"], each["data"]["cameras"]) for each in entries] == [
         ("done", site.robot.device, []),
