@@ -22,7 +22,8 @@ KIND: Final = "run_trial"
 """Kind of the action that runs a trial."""
 KEEP_MS: Final = 730 * DAY_MS
 """Time that trials are stored [ms]."""
-_NOT_REPORTED: Final = "The device did not report a verdict."
+NOT_REPORTED: Final = "The device did not report a verdict."
+"""Detail of a trial whose outcome is unknown."""
 _CONCURRENT_READS: Final = 16
 _MAX_PAGE: Final = 1_000
 """Most rows that one query of a table returns."""
@@ -127,7 +128,7 @@ def trial_of(action: Action) -> Trial | None:
         return trial
     if report is None:
         return replace(
-            trial, ended_ms=action.ended_ms, state="unknown", cause=TrialCause.LOST.value, detail=_NOT_REPORTED
+            trial, ended_ms=action.ended_ms, state="unknown", cause=TrialCause.LOST.value, detail=NOT_REPORTED
         )
     return replace(
         trial,

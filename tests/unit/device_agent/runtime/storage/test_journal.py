@@ -268,6 +268,12 @@ def test_movement_versions_never_decrease_and_belong_to_device_author_type_and_n
     assert journal.movement("arm", "a", "test", "other") == 0
 
 
+def test_a_device_without_consent_to_cameras_has_number_zero(journal: Journal) -> None:
+    assert journal.camera_consent("arm") == (0, b"")
+    journal.save_camera_consent("arm", 2, b"{}")
+    assert (journal.camera_consent("arm"), journal.camera_consent("other")) == ((2, b"{}"), (0, b""))
+
+
 def test_an_ended_command_of_a_previous_run_has_its_time_and_is_undelivered(open_journal: OpenJournal) -> None:
     traced = msgspec.structs.replace(ack("c1"), traceparent=TRACEPARENT)
     open_journal().begin("arm", traced, issued_ms=1)

@@ -1,18 +1,21 @@
 """Trials of tasks: what is stored about them, and their success rates."""
 
+import secrets
 from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
 import pytest
 
-from device_agent.protocol import AckStatus, Reason, RunTrial
+from device_agent.protocol import MAX_SEED, AckStatus, Reason, RunTrial
 from device_agent.protocol.manifests import tasks
 from device_agent.protocol.manifests.shipped import ROBOTS
 from function_app.domain.actions.action import LOST
 from function_app.domain.actions.trials import Trial, TrialBatch
+from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import Row
 from function_app.services.actions import trial_log
+from function_app.services.actions.tasks import RobotTypeTasks
 from function_app.services.actions.trial_log import KEEP_MS
 from function_app.services.autonomy import task_reports
 from function_app.services.storage import records
@@ -115,6 +118,11 @@ def test_a_trial_without_a_seed_gets_a_random_one(anna: Person, robot: Robot) ->
     assert action["request"]["seed"] == command.request.seed
 
 
+def test_a_random_seed_may_be_the_highest(anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(secrets, "randbelow", lambda end: end - 1)
+    assert begin(anna, robot, seed=None)["request"]["seed"] == MAX_SEED
+
+
 def test_a_repeated_command_of_a_trial_is_identical(cloud: Cloud, anna: Person, robot: Robot) -> None:
     robot.silent = True
     action = begin(anna, robot, wait_ms=0)
@@ -134,6 +142,10 @@ def test_a_success_is_stored_with_its_circumstances(cloud: Cloud, anna: Person, 
     assert (trial["action"], trial["device"], trial["epoch"]) == (action["id"], robot.device, action["epoch"])
     assert (trial["caller"], trial["software"], trial["type_version"]) == ("anna", "1.2", 3)
     assert (trial["movement"], trial["simulated"]) == ("pick_and_place", True)
+    (command,) = robot.received(RunTrial)
+    assert isinstance(command.request, RunTrial)
+    (row,) = rows(cloud, robot)
+    assert records.read(row, Trial).tasks_sha256 == command.request.tasks_sha256
     assert trial["ended_at"] >= trial["started_at"]
 
 
@@ -153,6 +165,8 @@ def test_an_end_without_a_valid_verdict_is_unknown(anna: Person, robot: Robot, c
     finish(anna, robot, action["id"], claim)
     (trial,) = trials(anna)
     assert (trial["state"], trial["cause"]) == ("unknown", "lost")
+    assert trial["ended_at"] >= trial["started_at"]
+    assert trial["detail"] == trial_log.NOT_REPORTED
     rate = report(anna)["rate"]
     assert (rate["trials"], rate["unknown"], rate["rate"]) == (0, 1, None)
 
@@ -165,6 +179,15 @@ def test_a_lost_link_makes_a_trial_unknown_until_the_device_reports(cloud: Cloud
     assert (trial["state"], trial["cause"]) == ("unknown", "lost")
     finish(anna, robot, action["id"], SUCCESS)
     assert [each["state"] for each in trials(anna)] == ["success"]
+
+
+def test_a_verdict_before_the_end_of_the_action_does_not_count(cloud: Cloud, anna: Person, robot: Robot) -> None:
+    robot.reports = lambda command: (robot.ack(command.id, AckStatus.RECEIVED, result={"trial": SUCCESS}),)
+    begin(anna, robot, timeout_ms=80_000, wait_ms=0)
+    pass_time(cloud, 2)
+    assert trials(anna) == []
+    pass_time(cloud, 100)
+    assert [each["state"] for each in trials(anna)] == ["unknown"]
 
 
 def test_a_trial_that_the_device_rejected_did_not_happen(cloud: Cloud, anna: Person, robot: Robot) -> None:
@@ -198,10 +221,27 @@ def test_a_trial_that_was_never_reported_stays_unknown(cloud: Cloud, anna: Perso
 
 def test_a_short_time_limit_of_the_action_is_rejected(anna: Person, robot: Robot) -> None:
     answer = anna.start(
-        robot.device, request={"kind": "run_trial", "name": TASK, "seed": 1}, timeout_ms=60_000, wait_ms=0
+        robot.device, request={"kind": "run_trial", "name": TASK, "seed": 1}, timeout_ms=74_999, wait_ms=0
     )
     problem(answer, 422, "invalid")
     assert "75000" in answer.json()["detail"]
+    begin(anna, robot, timeout_ms=75_000)
+
+
+def test_a_trial_is_the_task_of_the_devices_owner(
+    anna: Person, bert: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    owners: list[str] = []
+    get = RobotTypeTasks.get
+
+    async def recorded(tasks: RobotTypeTasks, caller: Identity, *task: str) -> Any:
+        owners.append(caller.account)
+        return await get(tasks, caller, *task)
+
+    monkeypatch.setattr(RobotTypeTasks, "get", recorded)
+    share(anna, f"devices/{robot.device}", bert, "operator")
+    begin(bert, robot)
+    assert owners == [anna.account]
 
 
 def test_rates_are_grouped_by_device_version_and_day(cloud: Cloud, anna: Person, robot: Robot) -> None:
@@ -323,6 +363,26 @@ def test_a_batch_is_stored_for_two_years(cloud: Cloud, anna: Person) -> None:
     assert cloud.run(cloud.functions.tables.query(records.TRIALS, partition)).rows == (row,)
     pass_time(cloud, 2 * DAY_S, step_s=DAY_S)
     assert cloud.run(cloud.functions.tables.query(records.TRIALS, partition)).rows == ()
+
+
+def test_the_deletion_of_a_trial_is_scheduled_once(
+    cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    retention = cloud.functions.trial_log._retention
+    delete_row_at, calls = retention.delete_row_at, []
+
+    async def recorded(table: str, partition: str, key: str, *, due_ms: int) -> None:
+        calls.append((table, partition, key, due_ms))
+        await delete_row_at(table, partition, key, due_ms=due_ms)
+
+    monkeypatch.setattr(retention, "delete_row_at", recorded)
+    action = begin(anna, robot)
+    finish(anna, robot, action["id"], SUCCESS)
+    (row,) = rows(cloud, robot)
+    trial = records.read(row, Trial)
+    due_ms = trial.started_ms + KEEP_MS
+    assert trial.expires_ms == due_ms
+    assert [call for call in calls if call[0] == records.TRIALS] == [(records.TRIALS, row.partition, row.key, due_ms)]
 
 
 def test_a_batch_whose_numbers_contradict_each_other_is_rejected(anna: Person) -> None:

@@ -1,5 +1,7 @@
 """Acquiring, renewing, losing and releasing control of a device."""
 
+import pytest
+
 from device_agent.protocol import GrantLease, ReleaseLease
 from device_agent.protocol.security import setpoints
 from function_app.ports.broker_access import Credentials
@@ -37,6 +39,21 @@ def test_a_lease_is_acquired_confirmed_renewed_and_released(anna: Person, robot:
     assert [anna.take_lease(robot.device).json()["epoch"] for _ in range(3)] == [3, 4, 5]
     problem(anna.take_lease(robot.device, epoch=4), 409, "lease-lost")
     assert anna.take_lease(robot.device, epoch=5).json()["epoch"] == 5
+
+
+def test_a_renewal_schedules_no_check_for_events(
+    cloud: Cloud, anna: Person, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checks: list[str] = []
+
+    async def schedule_check(device: str) -> None:
+        checks.append(device)
+
+    monkeypatch.setattr(cloud.functions.control_events, "schedule_check", schedule_check)
+    anna.take_lease(robot.device)
+    assert checks == [robot.device]
+    anna.take_lease(robot.device, epoch=1)
+    assert checks == [robot.device]
 
 
 def test_a_lease_excludes_other_sessions_until_it_expires(cloud: Cloud, anna: Person, robot: Robot) -> None:

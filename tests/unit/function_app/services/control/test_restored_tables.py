@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from device_agent.protocol import AckStatus, Mode, MoveJoints, Reason, State
+from device_agent.protocol import AckStatus, GrantLease, Mode, MoveJoints, Reason, State
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from function_app.domain.control.lease import MAX_EPOCH_JUMP
 from tests.fakes.agent import Robot
@@ -193,6 +193,17 @@ def test_a_lease_that_the_device_has_ended_is_not_replaced(anna: Person, robot: 
     answer = anna.start(robot.device, wait_ms=20_000, wait_for="done").json()
     assert (answer["status"], answer["reason"]["code"]) == ("failed", "lease_ended")
     assert len(robot.received(MoveJoints)) == 1
+
+
+def test_a_renewal_that_the_device_rejects_in_its_epoch_is_not_confirmed(
+    anna: Person, robot: Robot, gate: LeaseGate
+) -> None:
+    """The device ended the lease after a hold, so this is not a restored backup."""
+    anna.take_lease(robot.device)
+    gate.burn()
+    answer = anna.take_lease(robot.device, epoch=1, wait_ms=5_000)
+    assert (answer.status_code, answer.json()["confirmed"]) == (200, False)
+    assert len(robot.received(GrantLease)) == 2, "it is not sent again"
 
 
 class TestForgery:
