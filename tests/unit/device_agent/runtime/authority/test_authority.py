@@ -245,6 +245,30 @@ def test_only_a_restriction_to_zero_prevents_motion() -> None:
     assert refused.value.code == "interlock"
 
 
+@pytest.mark.parametrize("room", [False, True])
+def test_a_goal_of_the_running_action_needs_a_device_that_may_move(room: bool) -> None:
+    fixture = Fixture()
+    fixture.acting()
+    reservation = fixture.authority.reservation
+    assert reservation is not None
+    fixture.authority.check_goal(reservation)
+    if room:
+        fixture.authority.restrictions.set("person", 0.0, "a person is there")
+    else:
+        fixture.authority.suspended = "The agent restarts."
+    with refuses("interlock" if room else "restarting"):
+        fixture.authority.check_goal(reservation)
+
+
+def test_a_suspended_device_grants_no_lease() -> None:
+    fixture = Fixture()
+    fixture.authority.suspended = "The agent restarts."
+    with refuses("restarting"):
+        fixture.grant(3)
+    fixture.authority.suspended = ""
+    assert fixture.grant(3)
+
+
 def test_a_device_that_stops_itself_ends_lease_and_action_as_a_fault() -> None:
     fixture = Fixture()
     fixture.acting()
