@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from function_app.domain.common.problems import Problem
+from function_app.domain.common.timestamps import CLOCK_SKEW_MS
 from function_app.domain.control import lease as rules
 from function_app.domain.control.control_request import request_control
 from function_app.domain.control.lease import MAX_EPOCH_JUMP, RESTORE_JUMP, Lease
@@ -39,6 +40,20 @@ def test_only_an_expired_lease_is_granted_to_another_session(caller: Identity) -
     assert (problem.value.code, problem.value.status) == ("lease-held", 409)
     assert problem.value.extras == {"holder": "anna", "expires_at": "1970-01-01T00:17:40.000Z", "mine": False}
     assert rules.acquire(HELD, caller, lease_ms=1_000, now_ms=NOW + 60_000).epoch == 8
+
+
+@pytest.mark.parametrize(
+    ("now_ms", "live"),
+    [
+        (NOW - CLOCK_SKEW_MS - 1, False),
+        (NOW - CLOCK_SKEW_MS, True),
+        (NOW + 59_999, True),
+        (NOW + 60_000, False),
+    ],
+)
+def test_a_lease_is_live_until_its_end_unless_the_clock_was_set_back(now_ms: int, live: bool) -> None:
+    assert HELD.is_live(now_ms) is live
+    assert not replace(HELD, account="").is_live(now_ms)
 
 
 def test_a_renewal_changes_only_the_time_and_is_no_longer_for_one_action() -> None:

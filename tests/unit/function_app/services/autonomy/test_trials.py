@@ -339,6 +339,14 @@ def test_a_viewer_sees_trials_of_a_shared_device_only_while_it_is_shared(
     assert report(bert)["rate"]["trials"] == 0
 
 
+def test_a_trial_is_unknown_as_soon_as_its_account_loses_the_device(anna: Person, bert: Person, robot: Robot) -> None:
+    share(anna, f"devices/{robot.device}", bert, "operator")
+    begin(bert, robot)
+    assert [each["state"] for each in trials(anna)] == []
+    unshare(anna, f"devices/{robot.device}", bert)
+    assert [each["state"] for each in trials(anna)] == ["unknown"]
+
+
 def test_a_published_batch_is_shown_apart_from_trials_of_devices(anna: Person, bert: Person) -> None:
     answer = anna.post(f"{TASKS}/{TASK}/batches", BATCH)
     assert answer.status_code == 201, answer.text
