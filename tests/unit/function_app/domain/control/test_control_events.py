@@ -68,6 +68,12 @@ def test_a_change_is_one_event(before: Lease | None, after: Lease, expected: tup
     assert facts(before, after) == [(name, NOW, data, severity)]
 
 
+def test_a_rejection_names_both_accounts() -> None:
+    rejected = control_request.reject(REQUESTED, ANNA, request="r", now_ms=NOW)
+    (event,) = lease_changes(REQUESTED, rejected, by="dora", now_ms=NOW)
+    assert event.message == "dora rejected the request of bert for control."
+
+
 def test_only_a_lease_without_an_action_ends_with_a_release_event() -> None:
     held = replace(HELD, action="x")
     assert facts(held, lease.release(held, now_ms=NOW)) == []
@@ -85,6 +91,8 @@ def test_timeouts_before_a_change_are_recorded_with_their_own_time() -> None:
         ("control-taken-2", now_ms, {"epoch": 2, "holder": "bert"}, "info"),
     ]
     assert facts(HELD, lease.release(HELD, now_ms=now_ms), now_ms) == [expired]
+    reset = ("stop-reset-ordered-2", now_ms, {"epoch": 2, "caller": "dora", "holder": ""}, "info")
+    assert facts(HELD, lease.invalidate(HELD, pairing="p", now_ms=now_ms), now_ms) == [expired, reset]
     assert [event.id for event in timed_out(replace(REQUESTED, action="x"), now_ms)] == ["control-request-expired-r"]
     assert list(timed_out(REQUESTED, NOW + 9_999)) == []
     assert list(timed_out(Lease(epoch=1), now_ms)) == []

@@ -44,12 +44,7 @@ def test_only_an_expired_lease_is_granted_to_another_session(caller: Identity) -
 
 @pytest.mark.parametrize(
     ("now_ms", "live"),
-    [
-        (NOW - CLOCK_SKEW_MS - 1, False),
-        (NOW - CLOCK_SKEW_MS, True),
-        (NOW + 59_999, True),
-        (NOW + 60_000, False),
-    ],
+    [(NOW - CLOCK_SKEW_MS - 1, False), (NOW - CLOCK_SKEW_MS, True), (NOW + 59_999, True), (NOW + 60_000, False)],
 )
 def test_a_lease_is_live_until_its_end_unless_the_clock_was_set_back(now_ms: int, live: bool) -> None:
     assert HELD.is_live(now_ms) is live

@@ -3,6 +3,7 @@
 import pytest
 
 from device_agent.protocol import topics
+from function_app.domain.common.timestamps import rfc3339
 from function_app.ports.broker_access import Credentials
 from tests.fakes.agent import Robot
 from tests.fakes.broker import MemoryBroker, MemoryConnection
@@ -37,6 +38,8 @@ def test_viewing_covers_every_device_of_the_account_and_no_other(
         assert sorted(issued["publish"]) == sorted(f"{base}/stop/{anna.account}" for base in bases)
         tcp = {"host": "127.0.0.1", "port": 1, "tls": False, "certificate_after_ms": None}
         assert (issued["lifetime_s"], issued["tcp"]) == (900, tcp)
+        now_s = cloud.clock.now_ms() // 1000
+        assert issued["expires_at"] == rfc3339((now_s + 900) * 1000)
         with connect(broker, issued) as page:
             assert page.subscribe(*subscribe) == [1] * len(subscribe)
             page.subscribe(topics.conn(foreign.space, foreign.id), f"ts/v1/{foreign.space}/#", "ts/v1/#")

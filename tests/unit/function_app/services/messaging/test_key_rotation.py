@@ -6,7 +6,7 @@ import jwt
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from device_agent.protocol import AckStatus, Mode, RotateKey, RunMovement, State, codec, topics
+from device_agent.protocol import AckStatus, Mode, RotateKey, RunMovement, RunTrial, State, codec, topics
 from device_agent.protocol.security import signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
 from function_app.entrypoints.ingest.router import ingest
@@ -84,6 +84,26 @@ def test_a_session_continues_through_a_rotation(pair: Pair, cloud: Cloud, open_c
     assert again.get(MINE).status_code == 200, "movements signed with an old key remain readable"
     assert again.take_lease(robot.device, take_over=True, reason="on").json()["confirmed"]
     run(again, robot)
+
+
+def test_the_movement_of_a_trial_is_signed_with_the_new_key(cloud: Cloud, anna: Person) -> None:
+    path = "/robot-types/ur5_gripper/movements/pick_and_place"
+    assert anna.put(path, {"source": anna.get(path).json()["source"]}).status_code == 201
+    robot = cloud.robot()
+    robot.robot_type = "ur5_gripper"
+    robot.pair(anna)
+    robot.connect()
+    new = rotate(cloud)
+    follow(robot)
+    cloud.clock.advance(LEARN_S)
+    anna.start(robot.device, request={"kind": "run_trial", "name": "red_cube_in_green_tray", "seed": 1}, wait_ms=0)
+    cloud.settle()
+    (command,) = robot.received(RunTrial)
+    assert isinstance(command.request, RunTrial)
+    order = command.request.movement
+    assert order.key == new
+    text = signing.movement_text(order.robot_type, order.name, order.version, order.sha256)
+    signing.verify_text(text, order.signature, robot._keys[new], context=signing.MOVEMENT_CONTEXT)
 
 
 def get_devices(cloud: Cloud, token: str) -> int:
