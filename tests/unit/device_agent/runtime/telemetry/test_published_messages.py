@@ -26,6 +26,7 @@ from device_agent.protocol import (
 )
 from device_agent.protocol.camera_frames import CameraFrame, decode
 from device_agent.protocol.description import CameraStream
+from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
@@ -118,6 +119,14 @@ def described(fixture: Fixture) -> Description:
     ((topic, payload, options),) = fixture.sent
     assert (topic, options) == (BASE + "desc", {"qos": 1, "retain": True})
     return codec.decode(payload, Description)
+
+
+def test_a_retained_message_that_some_brokers_reject_is_not_sent(fixture: Fixture) -> None:
+    rest = len(codec.encode(Twin(device="", bodies=())))
+    fixture.publisher.publish_description(Twin(device="x" * (codec.MAX_RETAINED_BYTES - rest), bodies=()))
+    assert len(fixture.sent[-1][1]) == codec.MAX_RETAINED_BYTES
+    with pytest.raises(ProtocolError):
+        fixture.publisher.publish_description(Twin(device="x" * codec.MAX_RETAINED_BYTES, bodies=()))
 
 
 def test_the_description_has_the_data_of_robot_type_and_device(fixture: Fixture) -> None:
