@@ -292,6 +292,8 @@ def test_a_journal_of_a_newer_format_is_not_opened_and_not_changed(tmp_path: Pat
         assert database.execute("PRAGMA user_version").fetchone() == (JOURNAL_FORMAT,)
         database.execute(f"PRAGMA user_version={JOURNAL_FORMAT + 1}")
     before = path.read_bytes()
+    journal = Journal(path)
     with pytest.raises(JournalError, match="a newer release wrote it"):
-        Journal(path).open(now_ms=0)
+        journal.open(now_ms=0)
+    assert journal._database is None
     assert path.read_bytes() == before

@@ -206,6 +206,7 @@ def test_drop_events_are_stored_atomically(store: OutboxStore) -> None:
     store.count({(OWN + "arm", True): 2})
     assert dropped(store) == [DroppedCount(OWN + "arm", 4, 1), DroppedCount(OWN + "leg", 5, 0)]
     assert [stored.topic for _, stored in store.after(0, late=False, limit=9)] == [OWN + "arm/event", OWN + "leg/event"]
+    assert store.stored_bytes == store._read("SELECT sum(size) FROM items", ())[0][0]
 
 
 def test_a_damaged_file_is_replaced(open_store: OpenStore, tmp_path: Path) -> None:
@@ -221,6 +222,7 @@ def test_an_unusable_file_raises(tmp_path: Path) -> None:
     closed = OutboxStore(tmp_path / "missing" / "outbox.db", own=OWN, max_bytes=10**6, max_age_ms=1)
     with pytest.raises(OutboxStoreError, match="cannot be used"):
         closed.open()
+    assert closed._database is None
     for call in (lambda: closed.put([item(1)], now_ms=NOW_MS), lambda: closed.after(0, late=True, limit=1)):
         with pytest.raises(OutboxStoreError, match="is not open"):
             call()
@@ -242,11 +244,21 @@ def test_a_full_disk_changes_nothing_and_raises(tmp_path: Path, store: OutboxSto
         store.after(0, late=True, limit=1)
 
 
+def test_a_failed_change_is_rolled_back(store: OutboxStore) -> None:
+    store._connection().execute("DROP TABLE dropped")
+    with pytest.raises(OutboxStoreError):
+        store.count({(OWN + "arm", True): 1})
+    store.put([item(1)], now_ms=NOW_MS)
+    assert numbers(store) == [1]
+
+
 def test_a_file_of_a_newer_format_is_neither_used_nor_moved_away(open_store: OpenStore, tmp_path: Path) -> None:
     open_store().close()
     with closing(sqlite3.connect(tmp_path / "outbox.db")) as database:
         assert database.execute("PRAGMA user_version").fetchone() == (OUTBOX_FORMAT,)
         database.execute(f"PRAGMA user_version={OUTBOX_FORMAT + 1}")
+    newer = OutboxStore(tmp_path / "outbox.db", own=OWN, max_bytes=10**6, max_age_ms=1)
     with pytest.raises(OutboxStoreError, match="a newer release wrote it"):
-        open_store()
+        newer.open()
+    assert newer._database is None
     assert not (tmp_path / "outbox.damaged").exists()

@@ -24,10 +24,10 @@ class OutboxFixture:
         self.now_s = 1000.0
         self.restart()
 
-    def restart(self, max_bytes: int = 10**6) -> None:
+    def restart(self, max_bytes: int = 10**6, keep_hz: float = 1.0) -> None:
         self.store = OutboxStore(self.path, own="ts/v1/s/a/", max_bytes=max_bytes, max_age_ms=10**15)
         self.outbox = Outbox(
-            self.store, publish=self.publish, device_topic=ARM, is_quiet=lambda: self.quiet, keep_hz=1.0
+            self.store, publish=self.publish, device_topic=ARM, is_quiet=lambda: self.quiet, keep_hz=keep_hz
         )
 
     def publish(self, topic: str, payload: bytes, *, qos: int, delivered: Callable[[], None]) -> bool:

@@ -9,7 +9,9 @@ from unittest.mock import Mock
 
 import pytest
 
-from device_agent.protocol import Ack, AckStatus, Reason, codec
+from device_agent.protocol import Ack, AckStatus, Event, Reason, codec
+from device_agent.protocol.events import EventKind
+from device_agent.runtime.authority.event_recorder import EventRecord
 from device_agent.runtime.storage.journal import Journal, JournalError
 from device_agent.runtime.telemetry import device_publisher as module
 from device_agent.runtime.telemetry.device_publisher import DevicePublisher
@@ -30,6 +32,7 @@ class PublisherFixture:
         self.delivered: dict[str, Callable[[], None]] = {}
         self.steps: list[tuple[str, AckStatus, Reason | None]] = []
         self.ended: list[str] = []
+        self.recorded: list[Event] = []
         self.publisher = DevicePublisher(
             address=("s", "a", "arm"),
             label="Arm",
@@ -43,6 +46,7 @@ class PublisherFixture:
             publish=self.publish,
             outbox=cast("Any", None),
             traces=cast("Any", self),
+            record_event=self.recorded.append,
         )
 
     def step(self, command: str, status: AckStatus, reason: Reason | None) -> str:
@@ -107,6 +111,13 @@ def test_acks_have_their_sequence_reason_and_trace(fixture: PublisherFixture, mo
     assert fixture.steps[-1] == ("c1", AckStatus.FAILED, reason)
     for command in ("c1", "c2"):
         assert fixture.publisher.create_ack(command, AckStatus.FAILED).sequence == 1, "none before, or ended"
+
+
+def test_an_event_of_an_ack_is_recorded_for_the_device(fixture: PublisherFixture) -> None:
+    fixture.journal.begin("arm", fixture.publisher.create_ack("c1", AckStatus.RECEIVED), issued_ms=1)
+    event = EventRecord(EventKind.STOP_RESET, "on", "info", {}, 7)
+    fixture.publisher.report("c1", AckStatus.STARTED, recorded=event)
+    assert [(each.device, each.kind, each.at_ms) for each in fixture.recorded] == [("arm", "stop-reset", 7)]
 
 
 def test_the_pauses_grow_to_eight_seconds_and_the_repetition_ends_with_the_delivery(fixture: PublisherFixture) -> None:

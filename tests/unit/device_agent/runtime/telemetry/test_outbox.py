@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from device_agent.protocol.events import EventKind
+from device_agent.runtime.storage.outbox_store import OutboxItem
 from device_agent.runtime.telemetry import outbox as module
-from device_agent.runtime.telemetry.outbox import BUSY_RATE_HZ, RATE_HZ
+from device_agent.runtime.telemetry.outbox import BUSY_RATE_HZ, RATE_HZ, _Flight
 from tests.harness.agent.device_harness import WITHIN_S, eventually
 from tests.unit.device_agent.runtime.telemetry.outbox_fixture import ARM, LATE, OutboxFixture, fail
 
@@ -243,3 +244,49 @@ def test_a_hanging_disk_does_not_delay_the_stop(fixture: OutboxFixture, monkeypa
     assert fixture.outbox._thread.is_alive()
     released.set()
     fixture.outbox._thread.join(WITHIN_S)
+
+
+def test_a_new_link_sends_messages_in_flight_again_and_checks_the_bounds(
+    fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fixture.acknowledges = False
+    fixture.connect()
+    fixture.event("a")
+    fixture.iterate()
+    assert fixture.outbox._in_flight
+    checks: list[int] = []
+    monkeypatch.setattr(fixture.store, "enforce_bounds", lambda *, now_ms: checks.append(now_ms))
+    fixture.accepts = False
+    fixture.outbox.link_changed(False)
+    fixture.connect()
+    fixture.iterate()
+    assert not fixture.outbox._in_flight
+    assert checks
+
+
+def test_never_more_messages_are_taken_than_the_limit(fixture: OutboxFixture) -> None:
+    fixture.event("a", "b")
+    fixture.measure(0, 5)
+    fixture.iterate()
+    item = OutboxItem(ARM + "/event", b"c", 1, late=False)
+    for unsaved in ({}, {-1: item, -2: item}):
+        fixture.outbox._unsaved = dict(unsaved)
+        assert [len(fixture.outbox._next(fixture.now_s, limit)) for limit in range(4)] == [0, 1, 2, 3]
+
+
+def test_the_message_that_has_waited_longest_is_repeated_first(fixture: OutboxFixture) -> None:
+    item = OutboxItem(ARM + "/event", b"c", 1, late=False)
+    fixture.outbox._unsaved = {-2: item, -1: item}
+    fixture.outbox._in_flight = {
+        -2: _Flight(late=False, sent_s=9.0, pause_s=1.0),
+        -1: _Flight(late=False, sent_s=5.0, pause_s=1.0),
+    }
+    due = [[number for number, _ in fixture.outbox._due(fixture.now_s, limit)] for limit in range(3)]
+    assert due == [[], [-1], [-1, -2]]
+
+
+def test_measurements_are_stored_at_the_configured_rate(fixture: OutboxFixture) -> None:
+    fixture.restart(keep_hz=2.0)
+    fixture.measure(0, 8, each_s=0.25)
+    fixture.iterate()
+    assert fixture.stored(late=True) == ["0", "2", "4", "6"]

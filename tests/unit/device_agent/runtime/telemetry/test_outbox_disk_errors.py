@@ -36,6 +36,20 @@ def test_with_a_full_disk_events_are_sent_from_memory_and_one_event_reports_it(
     assert "disk full" in report.message
 
 
+def test_each_failure_of_the_disk_is_reported(fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    fixture.connect()
+    for number in range(2):
+        with monkeypatch.context() as patch:
+            patch.setattr(fixture.store, "put", fail)
+            fixture.event(str(number))
+            fixture.iterate(2)
+        fixture.iterate_for(2 * module._SAVE_RETRY_S)
+        fixture.event("stored")
+        fixture.iterate(2)
+    assert len(fixture.reports(EventKind.BUFFER_FAILED)) == 2
+    assert fixture.events() == ["0", "stored", "1", "stored"]
+
+
 def test_with_a_full_disk_events_wait_in_bounded_memory_and_measurements_are_counted(
     fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -70,6 +70,7 @@ class Fixture:
     def __init__(self, kind: RobotType, room: RoomDeviceManifest | None = None) -> None:
         self.sent: list[Sent] = []
         self.stored: list[Sent] = []
+        self.recorded: list[Event] = []
         self.accepts = True
         outbox = SimpleNamespace(
             add_measurement=lambda *message, **options: self.stored.append((*message, options)),
@@ -88,6 +89,7 @@ class Fixture:
             journal=cast("Any", None),
             publish=self.publish,
             outbox=cast("Any", outbox),
+            record_event=self.recorded.append,
         )
 
     def publish(self, topic: str, payload: bytes, **options: Any) -> bool:
@@ -127,6 +129,16 @@ def test_a_retained_message_that_some_brokers_reject_is_not_sent(fixture: Fixtur
     assert len(fixture.sent[-1][1]) == codec.MAX_RETAINED_BYTES
     with pytest.raises(ProtocolError):
         fixture.publisher.publish_description(Twin(device="x" * codec.MAX_RETAINED_BYTES, bodies=()))
+
+
+def test_events_are_also_recorded(fixture: Fixture) -> None:
+    fixture.publisher.publish_event(EventRecord(EventKind.STOP_RESET, "on", "info", {}, 7))
+    assert [(event.device, event.kind, event.at_ms) for event in fixture.recorded] == [("arm", "stop-reset", 7)]
+
+
+def test_a_description_that_was_not_published_is_not_updated(fixture: Fixture) -> None:
+    fixture.publisher.update_description()
+    assert fixture.sent == []
 
 
 def test_the_description_has_the_data_of_robot_type_and_device(fixture: Fixture) -> None:

@@ -385,6 +385,8 @@ def test_the_deletion_of_a_trial_is_scheduled_once(
 
     monkeypatch.setattr(retention, "delete_row_at", recorded)
     action = begin(anna, robot)
+    pass_time(cloud, 2)
+    assert [each["state"] for each in trials(anna)] == ["running"]
     finish(anna, robot, action["id"], SUCCESS)
     (row,) = rows(cloud, robot)
     trial = records.read(row, Trial)
