@@ -21,6 +21,7 @@ SUCCESS = {"verdict": "success", "duration_s": 12.5, "simulated": True, "softwar
 
 
 def gripper(cloud: Cloud, owner: Person) -> Robot:
+    """A connected robot of a type with tasks."""
     robot = cloud.robot()
     robot.robot_type = "ur5_gripper"
     robot.pair(owner)
@@ -46,10 +47,12 @@ def finish(person: Person, robot: Robot, action: str, trial: Any, status: AckSta
 
 
 def trials(person: Person, **query: Any) -> list[dict[str, Any]]:
+    """The trials of the task, newest first."""
     return person.pages(TRIALS, **query)
 
 
 def report(person: Person) -> dict[str, Any]:
+    """The task with its success rates and batches."""
     answer = person.get(f"{TASKS}/{TASK}")
     assert answer.status_code == 200, answer.text
     body: dict[str, Any] = answer.json()
@@ -57,12 +60,14 @@ def report(person: Person) -> dict[str, Any]:
 
 
 def partition_of(cloud: Cloud, robot: Robot) -> str:
+    """Partition of the robot's trials in the table."""
     device = cloud.run(cloud.functions.devices.get_as_owner(robot.device))
     assert device is not None
     return f"{robot.device}/{device.pairing}"
 
 
 def rows(cloud: Cloud, robot: Robot) -> tuple[Any, ...]:
+    """The stored rows of the robot's trials."""
     return tuple(cloud.run(cloud.functions.tables.query(records.TRIALS, partition_of(cloud, robot))).rows)
 
 
