@@ -246,7 +246,7 @@ def test_a_hanging_disk_does_not_delay_the_stop(fixture: OutboxFixture, monkeypa
     fixture.outbox._thread.join(WITHIN_S)
 
 
-def test_a_new_link_sends_messages_in_flight_again_and_checks_the_bounds(
+def test_on_a_new_link_no_message_is_in_flight_and_the_bounds_are_checked(
     fixture: OutboxFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fixture.acknowledges = False
