@@ -3,6 +3,8 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# Each interpreter would compile its packages again, and the tests start several hundred: twice the processor time.
+unexport PYTHONDONTWRITEBYTECODE
 # The machine's Node.js if it is new enough, else the one from a Python wheel.
 NODE_READY = command -v npm >/dev/null && node -e 'process.exit(parseInt(process.versions.node) >= 20 ? 0 : 1)'
 NODE = PATH="$$({ $(NODE_READY); } 2>/dev/null || printf %s '$(CURDIR)/$(BIN):')$$PATH" npm
