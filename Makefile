@@ -3,7 +3,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-# Each interpreter would compile its packages again, and the tests start several hundred: twice the processor time.
+# Without stored bytecode each program compiles its packages again, and the tests start several hundred programs.
 unexport PYTHONDONTWRITEBYTECODE
 # The machine's Node.js if it is new enough, else the one from a Python wheel.
 NODE_READY = command -v npm >/dev/null && node -e 'process.exit(parseInt(process.versions.node) >= 20 ? 0 : 1)'

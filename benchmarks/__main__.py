@@ -24,7 +24,11 @@ def main() -> int:
     unknown = sorted(set(chosen.suites) - set(suites.NAMES))
     if unknown:
         parser.error(f"unknown suite {', '.join(unknown)}; choose from {', '.join(suites.NAMES)}")
-    reports = [run(name, quick=chosen.quick) for name in chosen.suites or suites.NAMES]
+    try:
+        reports = [run(name, quick=chosen.quick) for name in chosen.suites or suites.NAMES]
+    except KeyboardInterrupt:
+        print("\ninterrupted: the suite that was running has no report; complete suites are saved", file=sys.stderr)
+        return 130
     if not chosen.quick:
         page.write()
     claims = [claim for report in reports for claim in report.claims]

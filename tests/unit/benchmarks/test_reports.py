@@ -3,6 +3,7 @@
 import pytest
 
 from benchmarks import suites
+from benchmarks.__main__ import main
 from benchmarks.baseline.interleaved import measure_interleaved, table
 from benchmarks.reporting import cost_model, page
 from benchmarks.reporting.report import Claim, Report, Table, format_cell, load, percentile, save
@@ -83,3 +84,15 @@ def test_unknown_prices_are_shown_as_a_formula() -> None:
     assert cost_model.cost({"A": {"value": 0.5}}, "A", 12.0) == "6 $"
     steps = [{"known": known, "processor_ms_each": 1 + known / 10} for known in (100, 200, 400)]
     assert cost_model.slope_s(steps) == pytest.approx(1e-4)
+
+
+def test_an_interrupted_suite_ends_without_a_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(**_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("benchmarks.suites.kills.run", interrupted)
+    monkeypatch.setattr("sys.argv", ["benchmarks", "kills", "--quick"])
+    assert main() == 130
+    assert "has no report" in capsys.readouterr().err
