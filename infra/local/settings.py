@@ -138,13 +138,14 @@ def load_started(environment: Mapping[str, str]) -> dict[str, str]:
     """The environment, completed by the settings of the folder's last start.
 
     Raises:
-        SettingsError: The stored settings cannot be read.
+        SettingsError: Telescope was never started in the folder, or the stored settings cannot be read.
     """
     path = _home(environment) / _STARTED
     try:
         values = json.loads(path.read_text())
-    except FileNotFoundError:
-        return dict(environment)
+    except FileNotFoundError as error:
+        reason = f"Telescope was never started in {path.parent}; run `make up`, or set TELESCOPE_HOME to its folder"
+        raise SettingsError(reason) from error
     except (OSError, ValueError) as error:
         raise SettingsError(f"cannot read {path} ({error}); delete it and run `make up` once") from error
     if not isinstance(values, dict):

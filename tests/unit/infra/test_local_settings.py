@@ -46,10 +46,15 @@ def test_other_commands_use_the_settings_of_the_last_start(tmp_path: Path) -> No
     assert settings.load_started(home) == home
 
 
+def test_a_folder_in_which_nothing_was_started_is_reported(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="never started in .*absent; run `make up`, or set TELESCOPE_HOME"):
+        settings.load_started({"TELESCOPE_HOME": str(tmp_path / "absent")})
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", '"x"'])
 def test_invalid_stored_settings_are_reported(tmp_path: Path, text: str) -> None:
     home = {"TELESCOPE_HOME": str(tmp_path)}
-    assert settings.load_started(home) == home
     (tmp_path / "started.json").write_text(text)
     with pytest.raises(SettingsError, match=r"started.json .*; delete it and run `make up` once"):
         settings.load_started(home)
