@@ -47,7 +47,7 @@ def test_other_commands_use_the_settings_of_the_last_start(tmp_path: Path) -> No
 
 
 def test_a_folder_in_which_nothing_was_started_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="never started in .*absent; run `make up`, or set TELESCOPE_HOME"):
+    with pytest.raises(SettingsError, match=r"never started in .*absent; run `make up`, or set TELESCOPE_HOME"):
         settings.load_started({"TELESCOPE_HOME": str(tmp_path / "absent")})
     assert list(tmp_path.iterdir()) == []
 
